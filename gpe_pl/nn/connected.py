@@ -1,6 +1,6 @@
-"""Nodes with edges, and their order in memory.
+"""Selects the nodes that have edges, and sorts nodes in memory.
 
-Nodes without an edge take no part in message passing, and nodes of one edge should be near each other in memory.
+Nodes without an edge need no message passing. Message passing is faster if the nodes at both ends of an edge are near each other in memory.
 """
 
 from __future__ import annotations

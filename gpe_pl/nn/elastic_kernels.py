@@ -195,10 +195,14 @@ def move_forward(
 ):  # fmt: skip
     """Integrate all scenes, each with its own number of substeps.
 
-    Rows after the last substep of a scene stay undefined. ``path`` gets the positions at the start of each substep and at the end [substep + 1, node, dim].
-    ``speed_path`` gets the first velocities, then those in the middle of each substep after contact [substep + 1, node, dim], and ``pushed`` those before
-    contact [substep, node, dim]. ``contacts`` [substep, pair, 6] gets the normal, place, stop and factors of both ends of ``_stop_at_corner``, and ``last_vel``
-    the velocities at the end of the frame.
+    These arrays are results. Rows after the last substep of a scene stay undefined:
+
+    - ``path`` [substep + 1, node, dim]: positions at the start of each substep, and at the end of the frame.
+    - ``speed_path`` [substep + 1, node, dim]: velocities at the start of the frame, then those in the middle of each substep after contact.
+    - ``pushed`` [substep, node, dim]: velocities in the middle of each substep before contact.
+    - ``contacts`` [substep, pair, 6]: normal, place on the edge, fraction of the tangential velocity that friction stops, and the weights of both ends, as
+      ``_stop_at_corner`` writes them.
+    - ``last_vel`` [node, dim]: velocities at the end of the frame.
     """
     dim = pos.shape[1]
     force = np.empty_like(pos)

@@ -80,7 +80,7 @@ class Step:
         return [t for group in (*self.convs.values(), *self.updates.values()) for t in group if t is not None]
 
     def of(self, tensors: list[Tensor]) -> Step:
-        """Return the same step with other tensors, which are removed from the front of the list."""
+        """Return a step of the same form whose parameters are the first tensors of the list. They are removed from the list."""
 
         def taken(group: Any) -> Any:
             return type(group)(*(None if t is None else tensors.pop(0) for t in group))

@@ -17,7 +17,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.schema import EdgeType, FeatureSpec, role
 
 MaterialEmbeddingKind = Literal["feature", "none"]
-"""Whether material parameters are features of nodes like the others, or left out as a control."""
+"""``feature``: material parameters are features of nodes. ``none``: they are left out, for comparison."""
 
 Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
 """``edge_index``, ``odd`` and ``even`` of each relation that has edges."""

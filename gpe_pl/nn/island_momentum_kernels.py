@@ -1,4 +1,4 @@
-"""The rigid part of the accelerations of groups of nodes in one compiled pass, for rollouts on a CPU; see ``island_momentum`` for the equations.
+"""Compiled loops of ``nn.island_momentum``: they remove the rigid part of the accelerations of groups of nodes, in rollouts on a CPU.
 
 Sums are in double precision.
 """
@@ -17,7 +17,7 @@ NUM_SWEEPS = 12
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def remove_rigid_part(acceleration, mass, pos, group, is_wanted, angular, smallest):
-    """Subtract the rigid part from accelerations, in place.
+    """Subtract the rigid part from accelerations, in place; ``island_momentum`` has the equations.
 
     Args:
         acceleration: accelerations [node, dim].

@@ -20,7 +20,10 @@ from numba.extending import get_cython_function_address, intrinsic
 
 @cache
 def gemm_address(dtype: Any) -> int:
-    """Return the address of the matrix product of a precision: PyTorch's, which keeps to its number of threads, or SciPy's if PyTorch shows none."""
+    """Return the address of the BLAS function ``sgemm`` or ``dgemm`` for a precision.
+
+    It is the one in PyTorch's library, which uses PyTorch's number of threads, or SciPy's if that library exports none.
+    """
     name = "dgemm" if dtype == np.float64 else "sgemm"
     for library in sorted((Path(torch.__file__).parent / "lib").glob("libtorch_cpu.*")):
         try:

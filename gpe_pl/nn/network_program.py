@@ -1,6 +1,11 @@
-"""A network as a list of instructions, with sets of rows, matrices and weights, which ``network_program_kernels.run`` executes in one call.
+"""Network programs: a network as a list of instructions, which one compiled call executes in a rollout on a CPU.
 
-A model writes its layers with the methods of ``NetworkProgram``. Weights are copied when the program is written, so write it again when they change.
+A model writes its layers with the methods of ``NetworkProgram``. ``Executable`` runs the program, with the loops of ``network_program_kernels``. Weights are
+copied when the program is written, so write it again when they change. These terms are used:
+
+- A *set of rows* is the nodes of a type, those of them with or without an edge, or the edges of a relation. Its number of rows differs from graph to graph.
+- A *matrix* has the rows of one set, or scratch memory for one block of rows. Sets, matrices and weights are named by their number in the program.
+- A *segment* is a list of instructions that is executed for one block of the rows of a set after the other.
 """
 
 from __future__ import annotations
@@ -27,7 +32,7 @@ ALIGNED = 16
 
 @dataclass(frozen=True)
 class NodeType:
-    """Number of a type of nodes, and its sets of rows: all nodes, those with an edge, and those without."""
+    """A type of nodes: its number, and the numbers of its sets of rows: every node, nodes with an edge (``connected``), and nodes without (``isolated``)."""
 
     number: int
     every: int
@@ -37,14 +42,17 @@ class NodeType:
 
 @dataclass
 class NetworkProgram:
-    """A network as instructions.
+    """A network as a list of instructions.
+
+    Methods that add an instruction take the numbers of matrices (``y``, ``x``, …); a pair is a matrix and a column in it. ``network_program_kernels`` has the
+    equations. With ``needs``, an instruction is skipped if this set of rows is empty.
 
     Args:
         dtype: precision of all matrices.
 
     Attributes:
-        node_types: sets of rows of each type of nodes.
-        relations: set of rows of each relation.
+        node_types: types of nodes by name.
+        relations: number of the set of rows of each relation.
     """
 
     dtype: torch.dtype
@@ -60,7 +68,7 @@ class NetworkProgram:
     # --- rows, matrices and weights ---------------------------------------------------------------------------------------------------------
 
     def node_type(self, name: str) -> NodeType:
-        """Add a type of nodes with new sets of rows."""
+        """Add a type of nodes, with new sets of rows, and return it."""
         first = self.new_set(), self.new_set(), self.new_set()
         self.node_types[name] = NodeType(len(self.node_types), *first)
         return self.node_types[name]
@@ -71,12 +79,12 @@ class NetworkProgram:
         return self.num_sets - 1
 
     def matrix(self, rows: int, columns: int) -> int:
-        """Add a matrix with the rows of a set, or for ``NONE`` with those of one block, and return its number."""
+        """Add a matrix and return its number. Its rows are those of the set ``rows``, or with ``NONE`` those of one block."""
         self.matrices.append((rows, max(columns, 1)))
         return len(self.matrices) - 1
 
     def weight(self, values: Tensor) -> int:
-        """Add weights, and return their place."""
+        """Add weights, and return the index at which they start in the array of all weights."""
         flat = values.detach().to(self.dtype).contiguous().numpy().ravel()
         self.weights.append(flat)
         self.num_weights += len(flat)
@@ -84,7 +92,7 @@ class NetworkProgram:
 
     @contextmanager
     def segment(self, rows: int) -> Iterator[None]:
-        """Add a segment: the instructions that are written in this context, for the rows of a set."""
+        """Add a segment for the set ``rows``. It consists of the instructions that are added inside this context."""
         first = len(self.instructions)
         yield
         if len(self.instructions) > first:
@@ -104,15 +112,19 @@ class NetworkProgram:
             self._add(kernels.ZERO, y, needs=needs)
 
     def bias(self, y: int, bias: Tensor, column: int = 0, needs: int = NONE) -> None:
+        """Add a bias to the columns of y from ``column`` on."""
         self._add(kernels.BIAS, y, column, self.weight(bias), len(bias), needs=needs)
 
     def degree(self, y: int, degree: int, column: int, bias: Tensor, needs: int = NONE) -> None:
+        """Add a bias to y, times the number in a column of the matrix ``degree``."""
         self._add(kernels.DEGREE, y, degree, self.weight(bias), len(bias), column, needs=needs)
 
     def activate(self, y: int, bias: Tensor, slope: Tensor, needs: int = NONE, fills: bool = False) -> None:
+        """Replace y by the PReLU of y plus a bias. With ``fills``, y counts as zero if no product was joined to it."""
         self._add(kernels.ACTIVATE, y, self.weight(bias), self.weight(slope), len(bias), int(fills), needs=needs)
 
     def normalize(self, h: int, y: int, bias: Tensor, norm: torch.nn.LayerNorm, adds: bool) -> None:
+        """Write the LayerNorm of y plus a bias to h, or add it to h if ``adds``."""
         eps = self.weight(torch.tensor([norm.eps], dtype=torch.float64))
         self._add(
             kernels.NORMALIZE,
@@ -127,46 +139,58 @@ class NetworkProgram:
         )
 
     def residual(self, h: int, y: int, bias: Tensor) -> None:
+        """Add y plus a bias to h."""
         self._add(kernels.RESIDUAL, y, h, self.weight(bias), len(bias))
 
     def zero(self, y: int) -> None:
+        """Set y to zero."""
         self._add(kernels.ZERO, y)
 
     def divide(self, y: int, divisor: int) -> None:
+        """Divide the rows of y by the first column of ``divisor``. y counts as zero if no product was joined to it."""
         self._add(kernels.DIVIDE, y, divisor)
 
     # --- instructions of edges; ends are 1 for the target and 0 for the source ---------------------------------------------------------------
 
     def messages(self, w: int, width: int, slope: Tensor, target: tuple[int, int], source: tuple[int, int], at_target: tuple[int, int], at_source: tuple[int, int]) -> None:  # fmt: skip  # noqa: E501
-        """Gather a (target) and b (source), add w, activate, and add to the sums at the target, and subtract from those at the source."""
+        """Compute messages from a (at the target), b (at the source) and w (of the edge). Add them to sums at the target and subtract them at the source."""
         self._add(kernels.MESSAGES, w, *target, *source, width, self.weight(slope), *at_target, *at_source)
 
     def gather(self, w: int, width: int, slope: Tensor, own: tuple[int, int], other: tuple[int, int], end: int = 1) -> None:
-        """Replace w by the activation of a (at ``end``), b (at the other end) and w."""
+        """Replace w by the PReLU of the sum of a (at ``end``), b (at the other end) and w."""
         self._add(kernels.GATHER, w, *own, *other, width, self.weight(slope), end)
 
     def gather_odd(self, w: int, u: int, width: int, slope: Tensor, nodes: int, a: int, b: int) -> None:
+        """Compute the activations of an edge in both directions. Replace w by their difference and u by their sum."""
         self._add(kernels.GATHER_ODD, w, nodes, a, b, u, width, self.weight(slope))
 
     def activate_odd(self, w: int, u: int, bias: Tensor, slope: Tensor) -> None:
+        """Replace w by the difference of the activations of u plus w and u minus w, each with a bias."""
         self._add(kernels.ACTIVATE_ODD, w, u, self.weight(bias), self.weight(slope), len(bias))
 
     def update(self, m: int, e: int, bias: Tensor) -> None:
+        """Add a bias to the messages m, and add the messages to the edge states e."""
         self._add(kernels.UPDATE, m, e, self.weight(bias), len(bias))
 
     def scatter(self, x: int, width: int, sums: tuple[int, int], sign: int, end: int, bodies: tuple[int, int] = (NONE, NONE)) -> None:
-        """Add rows to the sums at one end, or subtract them; edges within one body are left out if the types of their bodies are given."""
+        """Add the rows of edges, times ``sign``, to sums at one end. If the types of nodes at both ends are given, edges within one body are left out."""
         self._add(kernels.SCATTER, x, width, *sums, sign, end, *bodies)
 
     def count(self, degree: tuple[int, int], sign: int, end: int, bodies: tuple[int, int] = (NONE, NONE)) -> None:
+        """Add ``sign`` at one end of each edge, in a column of ``degree``; ``bodies`` as in ``scatter``."""
         self._add(kernels.COUNT, *degree, sign, end, *bodies)
 
 
 class Tables(NamedTuple):
-    """What a program reads and writes, a table for each kind; see ``network_program_io`` for the columns.
+    """Inputs and results of a program, as one integer table per kind with a row per tensor.
+
+    Two such objects describe a call: one says what the tensors are and stays the same, the other has their addresses and sizes. ``network_program_io``
+    documents the columns of both.
 
     Attributes:
-        nodes, edges, bodies: inputs: features of nodes, edges of relations, and the body of each node.
+        nodes: features of nodes.
+        edges: edges of relations and their features.
+        bodies: body of each node.
         results: results at nodes.
     """
 
@@ -181,7 +205,7 @@ class Executable:
 
     Args:
         program: the program.
-        kinds: what each input and result is.
+        kinds: what the tensors of each input and result are, as the arguments ``kinds`` of ``network_program_io``.
     """
 
     def __init__(self, program: NetworkProgram, kinds: Tables) -> None:
@@ -200,11 +224,13 @@ class Executable:
         """Run the program and return None. If an edge names a node that does not exist, return the number of its relation and run nothing.
 
         Args:
-            tensors: addresses and sizes of the inputs and results, whose memory must stay in use. Sizes are not checked.
+            tensors: addresses and sizes of the inputs and results, as the arguments ``arrays`` of ``network_program_io``. The memory must stay allocated. Sizes
+                are not checked.
             num_nodes: number of nodes of each type.
-            size: number of rows of each set: of all nodes of a type, or of all edges of a relation. Sets of nodes with or without an edge are counted here.
+            size: number of rows of each set of all nodes of a type, and of each relation. Those of nodes with or without an edge are ignored: the call counts
+                them.
             apart: leave nodes without an edge out of message passing.
-            sorts: order nodes in memory by their edges.
+            sorts: sort nodes in memory by the order in which edges reach them.
         """
         height = np.where(self.is_block, BLOCK, size[self.rows])
         length = (height * self.stride + ALIGNED - 1) // ALIGNED * ALIGNED

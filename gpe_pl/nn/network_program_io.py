@@ -1,7 +1,7 @@
-"""Reads a graph into the matrices of a compiled network, and writes the results back.
+"""Copies a graph into the matrices of a network program, and the results back into tensors.
 
-Nodes are renumbered. Nodes with an edge come first if isolated nodes are set apart. In large scenes, nodes have the order in which edges first reach them, so
-that neighbours are near each other in memory.
+Nodes are renumbered. Nodes with an edge come first if nodes without one are set apart. In large scenes, nodes have the order in which edges first reach them,
+so that neighbours are near each other in memory. In the functions, ``kinds`` say what the tensors are, and ``arrays`` have their addresses and sizes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gpe_pl.nn.pointers import matrix_at
 @njit(**OPTIONS)
 @no_type_check
 def find_wrong_edges(edge_kinds, edge_arrays, num_nodes):
-    """Return the first relation with an edge that names a node that does not exist, or ``NONE``; arguments as in ``number_nodes``."""
+    """Return the number of the first relation with an edge whose source or target does not exist, or ``NONE``; arguments as in ``number_nodes``."""
     for r in range(len(edge_kinds)):
         index = matrix_at(edge_arrays[r, 0], 2, edge_arrays[r, 3], num_nodes)
         for end in range(2):
@@ -35,10 +35,10 @@ def number_nodes(edge_kinds, edge_arrays, first_node, num_nodes, number, connect
     """Number the nodes of every type, those without an edge last if they are set ``apart``.
 
     Args:
-        edge_kinds, edge_arrays: relations, see ``load_edges``.
+        edge_kinds, edge_arrays: ``kinds`` and ``arrays`` of relations, see ``load_edges``.
         first_node: row in ``number`` at which the nodes of a type start [type].
         num_nodes: number of nodes [type].
-        number: the results [node].
+        number: result; new number of each node among those of its type [node].
         connected: number of nodes with an edge, or of all nodes if they are not set apart [type]; a result.
         apart: set nodes without an edge apart.
         sorts: number nodes in the order in which edges reach them.
@@ -75,10 +75,10 @@ def number_nodes(edge_kinds, edge_arrays, first_node, num_nodes, number, connect
 @njit(**OPTIONS)
 @no_type_check
 def load_nodes(kinds, arrays, number, first_node, work, offset, stride, height):
-    """Read the inputs of nodes.
+    """Copy the inputs of nodes into matrices.
 
     Args:
-        kinds: type, matrix, and number of columns of each input [input, 3].
+        kinds: node type, matrix, and number of columns of each input [input, 3].
         arrays: address, number of rows, and number of the first node of each tensor [input, 3].
         number, first_node: see ``number_nodes``.
         work, offset, stride, height: matrices, see ``network_program_kernels.run``.
@@ -97,12 +97,13 @@ def load_nodes(kinds, arrays, number, first_node, work, offset, stride, height):
 @njit(**OPTIONS)
 @no_type_check
 def load_edges(kinds, arrays, number, first_node, ends, first_edge, work, offset, stride):
-    """Read indices and features of edges; edges of symmetric relations are turned as ``momentum_conv.orient`` does.
+    """Copy the indices and features of edges. Edges of symmetric relations are turned as by ``momentum_conv.orient``.
 
     Args:
-        kinds: of each relation, the types of source and target, set of rows, matrix, number of odd and of even features, whether edges are turned, and matrix
-            for the features of the opposite direction or ``NONE`` [relation, 8].
-        arrays: addresses of indices, odd and even features, number of edges, and numbers of the first source and target of each relation [relation, 6].
+        kinds: for each relation, the node types of source and target, set of rows, matrix, number of odd and of even features, whether edges are turned, and
+            matrix for the features of the opposite direction or ``NONE`` [relation, 8].
+        arrays: for each relation, the addresses of indices, odd and even features, the number of edges, and the numbers of the first source and target
+            [relation, 6].
         number, first_node: see ``number_nodes``.
         ends, first_edge: source and target of all edges; a result. See ``network_program_kernels.run``.
         work, offset, stride: matrices, see ``network_program_kernels.run``.
@@ -141,13 +142,13 @@ def load_edges(kinds, arrays, number, first_node, ends, first_edge, work, offset
 @njit(**OPTIONS)
 @no_type_check
 def load_bodies(types_, arrays, number, first_node, body):
-    """Read the body of every node of these types; other nodes have none.
+    """Copy the body of every node of some types. Nodes of other types belong to no body.
 
     Args:
-        types_: type of each tensor [tensor].
+        types_: node type of each tensor [tensor].
         arrays: address, number of rows, and number of the first node of each tensor [tensor, 3].
         number, first_node: see ``number_nodes``.
-        body: the results, by number of the node [node].
+        body: result; body by the new number of the node, or ``NONE`` [node].
     """
     body[:] = NONE
     for k in range(len(types_)):
@@ -161,7 +162,7 @@ def load_bodies(types_, arrays, number, first_node, body):
 @njit(**OPTIONS)
 @no_type_check
 def store(kinds, arrays, number, first_node, work, offset, stride):
-    """Write results to tensors, in the original order of nodes.
+    """Copy results into tensors, in the original order of nodes.
 
     Args:
         kinds: type, matrix, and number of columns of each result [result, 3].

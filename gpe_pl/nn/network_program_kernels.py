@@ -1,8 +1,7 @@
-"""One compiled function that executes a network, given as a list of instructions on rows.
+"""Executes the instructions of a network program in one compiled function, ``run``. ``network_program`` writes the instructions and explains the terms.
 
-A *segment* is a list of instructions on the rows of one set: the nodes of a type, or the edges of a relation. It is executed for a block of rows at a time.
-What one instruction writes is then still in the cache when the next one reads it. Matrices are in one array, ``work``, and weights in another.
-``network_program`` writes the instructions.
+The instructions of a segment are executed for a block of rows at a time, so that what one instruction writes is still in the cache when the next one reads it.
+Matrices are in one array, ``work``, and weights in another.
 
 The table lists instructions, their arguments, and what they compute. Arguments are the numbers of matrices, the places of weights (W, b, gain, shift, ε, and
 the slope of the PReLU φ), and counts. ``column`` is the first of the columns that are read, ``to`` the first that are written, and n the number of columns.
@@ -214,12 +213,12 @@ def run(address, segments, instructions, offset, stride, is_block, span, height,
     """Execute all segments.
 
     Args:
-        address: ``matrix_product.gemm_address``.
+        address: result of ``matrix_product.gemm_address``.
         segments: set of rows, first instruction and end of the instructions of each segment [segment, 3].
         instructions: code, set of rows without which the instruction is skipped, and arguments [instruction, 16].
         offset, stride, is_block: place of each matrix in ``work``, its number of columns, and whether it has only the rows of one block [matrix].
         span: first row and end of the rows of each set [set, 2].
-        height: number of rows of each matrix that has all rows [matrix].
+        height: number of rows of each matrix that has all rows of its set [matrix].
         weights: all weights.
         work: all matrices.
         ends: source and target of the edges of all relations [edge, 2].

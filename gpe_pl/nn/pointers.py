@@ -1,4 +1,4 @@
-"""Arrays at addresses in compiled functions. Their memory has to live as long as they are used."""
+"""Arrays at memory addresses, for compiled functions. The memory must stay allocated while the arrays are in use."""
 
 from __future__ import annotations
 
