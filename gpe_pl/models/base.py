@@ -1,4 +1,4 @@
-"""The base class of all models: they map a graph to one prediction per dynamic node type."""
+"""Base class of all models. A model maps a graph to a prediction for each dynamic node type."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable

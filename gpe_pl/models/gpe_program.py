@@ -1,4 +1,4 @@
-"""GPE as a program of instructions, for rollouts on a CPU (see ``nn.network_program``).
+"""Writes GPE as a network program, for rollouts on a CPU (see ``nn.network_program``).
 
 The program computes what ``GPE.compute`` computes, up to rounding. Two pairs of linear maps are multiplied once, when the program is written: the last map of
 the messages with the first map of the update, and the material embedding with the first map of the encoder.
@@ -19,19 +19,20 @@ if TYPE_CHECKING:
     from gpe_pl.models.gpe import GPE
 
 Place = tuple[int, int]
-"""Number of a matrix of the program, and of the first of some of its columns."""
+"""Number of a matrix of the program, and number of a column in it, at which some columns start."""
 
 
 class GPEProgram:
-    """Writes the program of a GPE. Matrices and sets of rows are named by their number in the program (``nn.network_program``).
+    """Writes the program of a GPE. The attributes name matrices and sets of rows by their number in the program (``nn.network_program``).
 
     Attributes:
         program: the program.
-        types: name of the weights (``type_key``) for each node type of the graph that the network reads; several types may share weights.
-        relations: the same for each relation: the names of the weights of its ends, and its own name.
-        features: matrix of the node features, by name in ``types``.
+        types: name of the weights (``GPE.type_key``) of each node type that the network reads. Several types may share weights.
+        relations: for each relation, the name of the source's weights, its own name, and the name of the target's weights.
+        features: matrices of node features, by name in ``types``.
         params, mass: matrices of material parameters and masses, by material.
-        edges, states: matrix of the edge features or edge states, and that of the opposite direction or ``NONE``, by name in ``relations``.
+        edges, states: matrices of edge features and of edge states, by names in ``relations``. Each is a pair: the matrix of the stored direction, and that of
+            the opposite direction or ``NONE``.
         acceleration, stress, contact: matrices of the results, by material; see ``gpe_program_runner.Decoded``.
         stress_rows: set of rows that is empty if no stress is wanted.
     """

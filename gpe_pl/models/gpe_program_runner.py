@@ -1,11 +1,11 @@
-"""Runs a GPE as a program in one compiled call, on a CPU without gradients.
+"""Runs a GPE as a network program: one compiled call per forward pass, on a CPU without gradients.
 
-``GPE.forward`` uses it in evaluation mode without gradients. ``system.compiled.unfused`` switches it off. PyTorch's operations take over, with a notice in
+``GPE.forward`` does so in evaluation mode without gradients. ``system.compiled.unfused`` switches it off. PyTorch's operations take over, with a notice in
 the log, if a submodule has hooks, if the model is a subclass of ``GPE``, if the weights were made in inference mode, or if a graph has another precision,
 device or shape than the weights.
 
-The program has a copy of the weights. It is written again when PyTorch counts a change of a weight, and after ``train()``. Writing through ``weight.data`` or
-NumPy in evaluation mode is not counted: call ``model.train()`` and ``model.eval()`` afterwards.
+The program has a copy of the weights. It is written again when PyTorch's version counter of a weight changes, and after ``train()``. Writing through
+``weight.data`` or NumPy in evaluation mode does not change the counter: call ``model.train()`` and ``model.eval()`` afterwards.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ class Decoded(NamedTuple):
 
 @lru_cache
 def notice(reason: str) -> None:
-    """Log a reason why a model is not compiled, each reason once per process."""
+    """Log why a forward pass does not use the program. Each reason is logged once per process."""
     log.info("the network runs by PyTorch's operations, which is slower: %s", reason)
 
 
 class GPEProgramRunner:
-    """A GPE that is ready to run, with its present weights.
+    """The program of a GPE with the present weights of the model, ready to run.
 
     Args:
         model: the model.
@@ -104,7 +104,7 @@ class GPEProgramRunner:
         return self.spec.stress_channels[material] if name == "stress" else self.spec.dim
 
     def is_current(self) -> bool:
-        """Tell whether the model still has the layers and weights of the program."""
+        """Tell whether the model still has the layers and weights with which the program was written."""
         return all(map(is_, [own.get(name) for own, name in self._places], self._parts)) and self._state_of_weights() == self._state
 
     def _state_of_weights(self) -> tuple[list[int], list[int]]:
