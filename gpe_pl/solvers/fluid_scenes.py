@@ -39,7 +39,7 @@ NonNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 @dataclass(frozen=True, config={"extra": "forbid"})
 class TerrainOptions:
-    """Options of ``read_terrain``, which describes them."""
+    """Options ``fit``, ``up``, ``solid`` and ``relief`` of ``geometry.terrain.read_terrain``, which describes them."""
 
     fit: Fit = "contain"
     up: Up = "z"

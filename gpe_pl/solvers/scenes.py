@@ -390,7 +390,7 @@ def check_obstacle_shapes(shapes: ObstacleShapes, dim: int) -> None:
 
 
 def angular_obstacle(center: np.ndarray, radius: float, friction: float, rng: np.random.Generator) -> Polygon:
-    """Draw a star of four to six points, or a tilted ramp four times as long as thick, within a circle; lengths in m."""
+    """Draw a star of four to six points, or a tilted ramp four times as long as thick, within the circle of this centre [m] and radius [m]."""
     angle = rng.uniform(0, 2 * math.pi)
     if rng.random() < 0.5:
         points = 2 * int(rng.integers(4, 7))

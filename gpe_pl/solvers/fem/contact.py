@@ -359,9 +359,15 @@ def _facing_edge(x, y, pos, edges, reach):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def resist_corners(pos, vel, mass, edges, box, reach, h, corners, touched, gaps):
-    """Slow down mesh edges that obstacle corners would cross.
+    """Slow down mesh edges that obstacle corners would cross in a substep of length ``h`` [s]; ``box`` and ``reach`` as in ``resist_nodes``.
 
-    For each corner, the edge within reach (-1: none) and its gap are written to ``touched`` and ``gaps`` [corner].
+    For each corner, the nearest edge within reach (-1: none) and its gap [m] are written to ``touched`` and ``gaps`` [corner].
+
+    Args:
+        pos, vel: positions [m] and velocities [m/s] of nodes; the velocities change.
+        mass: masses of nodes [kg].
+        edges: surface edges [edge, 2], the body on their left.
+        corners: as in ``Obstacles``.
     """
     for k in range(corners.shape[0]):
         touched[k] = -1
@@ -387,9 +393,10 @@ def resist_corners(pos, vel, mass, edges, box, reach, h, corners, touched, gaps)
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def push_out_corners(pos, mass, edges, corners, touched, gaps):
-    """Move edges back onto a corner that has crossed them because they rotated or stretched. A corner that was inside before keeps its depth.
+    """Move edges back onto a corner that has crossed them because they rotated or stretched, after the nodes moved.
 
-    Pushing such a corner out would store energy in the cells around it.
+    A corner that was inside the body before keeps its depth, because pushing it out would store energy in the cells around it. Arguments are as in
+    ``resist_corners``, which writes ``touched`` and ``gaps``.
     """
     for k in range(corners.shape[0]):
         e = touched[k]

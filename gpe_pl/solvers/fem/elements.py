@@ -275,7 +275,15 @@ def _plane_viscous(f00, f01, f10, f11, d00, d01, d10, d11, eta):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def add_triangle_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damped, force):
-    """Add the internal forces of linear triangles to ``force`` [node, 3]; return the largest A and 2η |F|² of any point."""
+    """Add the internal forces of linear triangles to ``force``. Return the largest A and the largest 2η |F|² of any quadrature point.
+
+    Args:
+        pos, vel: positions [m] and velocities [m/s] [node, 3]; the third component is zero in 2D.
+        cells, gradient, weight: as in ``Mesh``.
+        lam, mu, eta: Lamé parameters [Pa] and viscosity [Pa s] [cell].
+        damped: whether to add the viscous stress.
+        force: forces [N] [node, 3], in 2D per metre of depth.
+    """
     stiffest = most_viscous = 0.0
     for c in range(cells.shape[0]):
         i, j, k = cells[c, 0], cells[c, 1], cells[c, 2]
@@ -305,7 +313,7 @@ def add_triangle_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damped,
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def add_quad_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damped, force):
-    """Add the internal forces of bilinear quadrilaterals, at 2 × 2 points, to ``force`` [node, 3]; return the largest A and 2η |F|² of any point."""
+    """Add the internal forces of bilinear quadrilaterals, with 2 × 2 quadrature points, to ``force``; arguments and results as in ``add_triangle_forces``."""
     stiffest = most_viscous = 0.0
     for c in range(cells.shape[0]):
         i, j, k, n = cells[c, 0], cells[c, 1], cells[c, 2], cells[c, 3]
@@ -380,7 +388,7 @@ def _edge(x, i, j):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def add_tetrahedron_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damped, force):
-    """Add the internal forces of linear tetrahedra to ``force`` [node, 3]; return the largest A and 2η |F|² of any point."""
+    """Add the internal forces of linear tetrahedra to ``force``; arguments and results as in ``add_triangle_forces``."""
     stiffest = most_viscous = 0.0
     for c in range(cells.shape[0]):
         i = cells[c, 0]

@@ -26,7 +26,8 @@ def find_islands(active, strides, area, density, weight, liquid, island):
     Two particles that share a face of the grid are in one island, so islands do not act on each other.
 
     Args:
-        active: touched cells in ascending order.
+        active: indices of the cells that liquid reaches, in ascending order.
+        strides: index difference of neighbours along each axis [dim].
         area, weight: open fraction and density of faces [axis, cell].
         density: density of cells [cell].
         liquid: number of each liquid cell, 0 for the others [cell].
@@ -85,7 +86,13 @@ class Flying:
 
     @classmethod
     def select(cls, island: np.ndarray, is_free: np.ndarray, pos: np.ndarray, vel: np.ndarray, mass: np.ndarray) -> Flying:
-        """Copy the particles whose island [node] is free."""
+        """Copy the particles of free islands.
+
+        Args:
+            island: island of each particle, numbered from 0 [node].
+            is_free: whether each island touches no solid [island].
+            pos, vel, mass: positions, velocities and masses of all particles.
+        """
         node = np.flatnonzero(is_free[island])
         return cls(node, np.unique(island[node], return_inverse=True)[1], mass[node], pos[node], vel[node])
 

@@ -1,6 +1,6 @@
 """Preconditioned conjugate gradients for sparse symmetric positive (semi-)definite systems, shared by pressure and viscosity.
 
-A matrix is stored as its diagonal and its strict lower triangle by rows: row i has ``value[k]`` in column ``column[k] < i`` for k in
+A matrix is stored as its ``diagonal`` and its strict lower triangle by rows: row i has ``value[k]`` in column ``column[k] < i`` for k in
 ``start[i] … start[i + 1]``.
 """
 
@@ -75,9 +75,10 @@ def _precondition(start, column, value, inverse, r, z, above):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def conjugate_gradients(diagonal, start, column, value, right, inverse, x, tolerance, max_iterations):
-    """Improve x in place until the largest residual is at most ``tolerance``, for at most ``max_iterations``.
+    """Solve the system with the right-hand side ``right``, in place from the first guess ``x``, until the largest residual is at most ``tolerance``.
 
-    Return the number of iterations and the largest residual, which may exceed the tolerance.
+    ``inverse`` is the result of ``incomplete_cholesky``. Return the number of iterations, at most ``max_iterations``, and the largest residual, which may
+    exceed the tolerance then.
     """
     n = x.shape[0]
     r, z, s, q, above = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)

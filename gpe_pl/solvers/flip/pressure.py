@@ -7,6 +7,9 @@ scaled pressure ``p = h P / (ρ Δ)`` in m/s, the equations of the liquid cells 
     Σ_faces ± A (u - Δp) = 0,    u ← u - Δp,    Δp = p_c - p_n   or   p_c / θ towards an empty cell
 
 The correction of the particle density uses the same matrix (Kugelstadt et al. 2019).
+
+Arguments named like attributes of ``Grid``, ``Solids`` (both in ``grid``) or ``solver.Fields`` are these arrays. ``active`` are the indices of the cells that
+liquid reaches. ``unknown`` [cell] has the number of each liquid cell from 1, and 0 elsewhere. ``half`` is ``grid.HALF``.
 """
 
 from __future__ import annotations
@@ -78,7 +81,7 @@ def extend_into_solids(active, strides, area, cell_room, half, density, viscous)
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def liquid_cells(active, is_open, density, unknown):
-    """Number the liquid cells from 1 in ``unknown`` [cell], which is 0 elsewhere; return their list."""
+    """Write the numbers of the liquid cells, from 1, to ``unknown`` [cell], and return the indices of these cells [liquid]."""
     found = np.empty(active.shape[0], dtype=np.int64)
     n = 0
     for c in active:

@@ -221,7 +221,15 @@ class FLIP:
     def rasterize(
         self, pos: np.ndarray, vel: np.ndarray, mass: np.ndarray, viscosity_of_node: np.ndarray, solids: Solids, fields: Fields
     ) -> np.ndarray:
-        """Transfer the particles to empty ``fields``; return the active cells, which liquid reaches, in ascending order."""
+        """Transfer the particles to empty ``fields``. Return the active cells, which are those that liquid reaches, in ascending order.
+
+        Args:
+            pos, vel: positions [m] and velocities [m/s] of the particles [node, dim].
+            mass: masses [kg] [node].
+            viscosity_of_node: kinematic viscosities [m²/s] [node].
+            solids: open space of the grid.
+            fields: arrays of the grid, which get the results.
+        """
         grid = self.grid
         volume = mass / (self.density * grid.spacing**grid.dim)
         transfer.scatter(
@@ -263,9 +271,9 @@ class FLIP:
         return self.density * self.grid_spacing / h * self._correct("pressure", liquid, right, tolerance, solids, fields, fields.velocity)
 
     def even_out(self, liquid: Liquid, solids: Solids, fields: Fields, h: float) -> None:
-        """Find the shift that expands cells with too many particles and contracts cells with too few (Kugelstadt et al. 2019).
+        """Write to ``fields.shift`` the displacement that expands cells with too many particles and contracts cells with too few (Kugelstadt et al. 2019).
 
-        Bodies that fly freely are left out.
+        It is the part for a substep of length ``h`` [s]. Bodies that fly freely are left out.
         """
         if np.all(liquid.is_free):
             return

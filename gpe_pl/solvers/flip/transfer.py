@@ -1,7 +1,8 @@
 """Transfers between particles and grid: multilinear kernels, the FLIP/PIC update, advection, and pushing particles out of solids.
 
-All kernels work in two and three dimensions. Positions are in m, velocities in m/s. ``fraction`` is the position in a cell, ``w`` are the 2^dim corner weights
-of the kernel.
+All kernels work in two and three dimensions. Positions are in m, velocities in m/s. Arguments named like attributes of ``Grid``, ``Solids`` (both in ``grid``)
+or ``solver.Fields`` are these arrays; ``inverse`` is 1 / ``spacing``. ``active`` are the indices of the cells that liquid reaches. Inside kernels, ``fraction``
+is the position in a cell, and ``w`` are the 2^dim weights of its corners.
 """
 
 from __future__ import annotations
@@ -56,9 +57,9 @@ def scatter(pos, vel, volume, viscosity, origin, inverse, strides, counts, corne
         pos, vel: positions and velocities [node, dim] in m and m/s.
         volume: volume of each particle, in cells [node].
         viscosity: kinematic viscosity [node] in m²/s.
-        velocity, weight: Σ w V v and Σ w V on faces [axis, cell].
-        density, viscous: Σ w V and Σ w V ν at cell centres [cell].
-        touched: set to True where any of these changes [cell].
+        velocity, weight: results; Σ w V v and Σ w V on faces [axis, cell].
+        density, viscous: results; Σ w V and Σ w V ν at cell centres [cell].
+        touched: result; set to True where any of these changes [cell].
     """
     dim = pos.shape[1]
     fraction, w = np.empty(dim), np.empty(1 << dim)
@@ -83,9 +84,9 @@ def scatter(pos, vel, volume, viscosity, origin, inverse, strides, counts, corne
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def normalize(active, cell_room, face_room, smallest_room, velocity, old, weight, density, viscous):
-    """Turn the sums of ``scatter`` into velocities, copied to ``old``, and into densities relative to the open space.
+    """Divide the sums of ``scatter``, in place: momentum by mass, and mass by the open space. Velocities are also copied to ``old``.
 
-    Cells with less open space than ``smallest_room`` keep their sums. Faces with less count as having that much.
+    Cells with less open space than ``smallest_room`` are not divided by it. Faces with less are divided by ``smallest_room``.
     """
     for c in active:
         if cell_room[c] >= smallest_room:
@@ -139,7 +140,7 @@ def _distance_and_normal(x, p, origin, inverse, strides, counts, corners, distan
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def extend_into_solids(active, origin, spacing, strides, counts, corners, distance, face_distance, weight, velocity):
-    """Extrapolate velocities to faces with a solid centre near particles: the velocity of faces in free space around them, without its normal part.
+    """Extrapolate velocities to faces whose centre lies in a solid: that of nearby faces in free space, without the component normal to the solid.
 
     In the transfers, the liquid then slips along solids of any direction (Batty et al. 2007, section 4.3). Pressure may drive fast flow through the smallest
     openings; that flow then moves no particle.
@@ -190,10 +191,11 @@ def extend_into_solids(active, origin, spacing, strides, counts, corners, distan
 def gather(pos, vel, origin, spacing, strides, counts, corners, old, new, shift, weight, pic, h):
     """Move the particles with the grid for a time h, in place.
 
-    Velocities take the grid's change and the fraction ``pic`` of the grid's velocity. Positions follow the grid's velocity by the midpoint rule, and ``shift``,
-    by at most ``LONGEST_MOVE``.
+    With grid velocities interpolated to a particle, v ← (1 − pic) (v + u_new − u_old) + pic u_new. The position moves with u_new by the midpoint rule, and by
+    ``shift``; both together by at most ``LONGEST_MOVE``.
 
     Args:
+        pos, vel: positions and velocities of the particles [node, dim].
         old, new: velocities on faces before and after the forces [axis, cell] in m/s.
         shift: displacement on faces [axis, cell] in m.
         weight: weights of faces [axis, cell]; the velocity is known where the weight is positive.
@@ -240,7 +242,7 @@ def gather(pos, vel, origin, spacing, strides, counts, corners, old, new, shift,
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def push_out(pos, vel, origin, spacing, strides, counts, corners, distance):
-    """Move particles that are inside a solid, or within ``CONTACT`` of it, out along its normal, and remove the inward part of their velocity."""
+    """Move particles that are inside a solid or nearer than ``CONTACT`` out along its normal, and remove the inward part of their velocity, in place."""
     dim = strides.shape[0]
     inverse = 1.0 / spacing
     fraction, w, normal = np.empty(dim), np.empty(1 << dim), np.empty(dim)
@@ -263,7 +265,7 @@ def push_out(pos, vel, origin, spacing, strides, counts, corners, distance):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def clear(active, strides, velocity, old, shift, weight, density, viscous, touched, liquid, viscous_face):
-    """Set to zero what a substep has changed in the active cells and on their upper faces."""
+    """Set the arrays of ``solver.Fields`` to zero in the active cells and on their upper faces, after a substep."""
     dim = strides.shape[0]
     for c in active:
         density[c] = viscous[c] = 0.0

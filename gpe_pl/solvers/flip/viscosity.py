@@ -8,6 +8,9 @@ The free surface therefore needs no condition, and velocities without strain, su
 that the particles give to the grid, so momentum is conserved. Normal strains are sampled at cell centres, shear strains at edges. If one of the two faces in a
 difference quotient has a solid centre, the surface of the solid is used instead of that face: velocity is 0 at the fraction θ of the distance. The weight is
 multiplied by θ, which gives the finite-volume flux to a wall at that distance.
+
+Arguments named like attributes of ``Grid``, ``Solids`` (both in ``grid``) or ``solver.Fields`` are these arrays. ``active`` are the indices of the cells that
+liquid reaches. ``unknown`` [axis, cell] has the number of each face in the system from 1, and 0 elsewhere. ``step`` is h / Δ² in s/m².
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ SMALLEST_MASS = 1e-6
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def viscous_faces(active, face_distance, weight, unknown):
-    """Number the faces in free space that particles reach, from 1, in ``unknown`` [axis, cell], which is 0 elsewhere; return their axes and cells."""
+    """Write the numbers of the faces in free space that particles reach, from 1, to ``unknown`` [axis, cell], and return axes and cells of these faces."""
     dim = weight.shape[0]
     axes, cells = np.empty(dim * active.shape[0], dtype=np.int64), np.empty(dim * active.shape[0], dtype=np.int64)
     n = 0
@@ -130,7 +133,7 @@ def viscosity_system(axes, cells, unknown, strides, is_open, face_distance, weig
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def drag_on_solids(active, strides, area, face_distance, density, viscous, velocity, step):
-    """Slow down open faces with a solid centre as if all their neighbours were at rest, because the liquid there is next to the wall."""
+    """Slow down open faces whose centre lies in a solid, as if all their neighbours were at rest, because the liquid there is next to the wall."""
     dim = strides.shape[0]
     for c in active:
         for a in range(dim):

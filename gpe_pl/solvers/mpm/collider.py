@@ -142,7 +142,7 @@ def _require_resolved(shape: Shape, mask: np.ndarray, spacing: float, dim: int) 
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def keep_out(pos, vel, collider, counts, origin, inv):
-    """Apply ``push_out`` to all particles that may be inside a shape, by the signed distance at their nearest grid node."""
+    """Apply ``push_out`` to all particles that may be inside a shape, as the signed distance at their nearest grid node tells; arguments as there."""
     reach = 0.51 * math.sqrt(len(counts)) / inv
     for p in range(pos.shape[0]):
         node = 0
@@ -158,7 +158,10 @@ def keep_out(pos, vel, collider, counts, origin, inv):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def push_out(pos, vel, p, collider, counts, origin, inv):
-    """Move particle ``p`` out of every shape and remove the inward part of its velocity; walls come last, so that no particle ends outside them."""
+    """Move particle ``p`` out of every shape and remove the inward part of its velocity, in place. Walls come last, so that no particle ends outside them.
+
+    ``counts``, ``origin`` and ``inv`` describe the grid as in ``transfer_2d``.
+    """
     solid = len(counts) == 3
     for k in range(collider.sampled.shape[0]):
         depth, nx, ny, nz = _sampled_depth(pos, p, collider.sampled, k, counts, origin, inv)

@@ -22,10 +22,24 @@ OK, NOT_FINITE, ESCAPE, TOO_MANY_SUBSTEPS = 0, 1, 2, 3
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame_dt, cfl, max_substeps, last_substep):
-    """Advance the particles in place by one frame; return a status, the node that caused it, the number of substeps and the length of the last one.
+    """Advance the particles in place by one frame.
 
     Positions follow velocities half a substep later, so gravity acts over the mean of a substep and the one before. A body in free flight then stays on its
     parabola although substeps change. Particles deform over the time for which they have moved, which is the previous substep.
+
+    Args:
+        particles: all particles.
+        collider: walls and obstacles.
+        gravity: acceleration of gravity [dim] in m/s².
+        bounds: ``(low, high)`` of the domain per axis [m].
+        origin, counts, spacing: position of the first grid node [m], number of nodes per axis, and grid spacing [m].
+        frame_dt: time of a frame [s].
+        cfl: largest fraction of a cell that a wave or a particle may cross in a substep.
+        max_substeps: largest number of substeps.
+        last_substep: length of the substep before this frame [s]; 0 if there was none.
+
+    Returns:
+        A status such as ``OK``, the node that caused a failure (otherwise the fastest node), the number of substeps, and the length of the last one [s].
     """
     inv, dim, gravity_squared = 1.0 / spacing, len(counts), 0.0
     for axis in range(dim):

@@ -29,7 +29,7 @@ SMALLEST_SQUARE = SMALLEST_STRETCH**2
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def left_cauchy_green(f00, f01, f10, f11):
-    """Return the principal values of ``F Fᵀ``, larger first, and the direction ``(cos 2θ, sin 2θ)`` of the larger one."""
+    """Return the principal values of ``F Fᵀ``, larger first, and the direction ``(cos 2θ, sin 2θ)`` of the larger one, from the four entries of F."""
     b00, b01, b11 = f00 * f00 + f01 * f01, f00 * f10 + f01 * f11, f10 * f10 + f11 * f11
     half_difference = 0.5 * (b00 - b11)
     radius = math.sqrt(half_difference * half_difference + b01 * b01)

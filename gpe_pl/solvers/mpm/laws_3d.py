@@ -177,7 +177,7 @@ def sand(f, volume_correction, lam, mu, slope, intercept=0.0, tip=0.0):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def snow(f, compaction, lam, mu, xi, smallest, largest, max_hardening):
-    """Apply the law of snow; arguments as in ``laws_2d``. Return the return-mapped F, the new compaction, τ and the stiffness [Pa]."""
+    """Apply the law of snow; arguments as in ``laws_2d.snow``, with F as ``f``. Return the return-mapped F, the new compaction, τ and the stiffness [Pa]."""
     b1, b2, b3, axes, f = _squared_stretches(f)
     trial_1, trial_2, trial_3 = math.sqrt(b1), math.sqrt(b2), math.sqrt(b3)
     s1, s2, s3 = min(max(trial_1, smallest), largest), min(max(trial_2, smallest), largest), min(max(trial_3, smallest), largest)

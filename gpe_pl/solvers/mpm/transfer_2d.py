@@ -1,7 +1,9 @@
 """Transfers between particles and grid in 2D.
 
 ``grid`` holds three numbers for each node, one after the other: momentum or velocity, then mass. Node ``(i, j)`` has the index ``i n_y + j``. Indices are
-unsigned, which saves the test for negative ones.
+unsigned, which saves the test for negative ones. Kernels also take ``particles`` (``Particles``), their Kirchhoff ``stress`` [node, 3] in Pa, the number of
+grid nodes along each axis ``counts``, the position of the first grid node ``origin`` [m], the inverse of the grid spacing ``inv`` [1/m] and the substep ``h``
+[s].
 
 Stresses have a separate pass, so that the processor overlaps the slow logarithms, roots and divisions of several particles. For sand, a particle needs at least
 450 floating-point operations and 400 bytes from the second-level cache in each substep. With two operations per cycle at 3 GHz, the arithmetic takes 75 ns,
@@ -79,7 +81,7 @@ def deform(particles, stress, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def particles_to_grid(particles, stress, grid, counts, origin, inv, h):
-    """Add momentum, stress impulse and mass of the particles to the grid."""
+    """Add momentum, impulse of the stress, and mass of the particles to ``grid``, the second line of the equations in ``gpe_pl.solvers.mpm``."""
     pos, vel, affine, mass, specific_volume = particles.pos, particles.vel, particles.affine, particles.mass, particles.specific_volume
     spacing, stride = 1.0 / inv, counts[1]
     for p in range(pos.shape[0]):
@@ -109,7 +111,7 @@ def particles_to_grid(particles, stress, grid, counts, origin, inv, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def grid_to_particles(particles, grid, counts, origin, inv, h):
-    """Interpolate velocities and their gradients from the grid, and move the particles."""
+    """Interpolate velocities and their gradients from ``grid``, and move the particles, the fourth line of the equations in ``gpe_pl.solvers.mpm``."""
     pos, vel, gradient = particles.pos, particles.vel, particles.gradient
     stride = counts[1]
     for p in range(pos.shape[0]):

@@ -1,4 +1,7 @@
-"""Transfers between particles and grid in 3D, as in ``transfer_2d``; a node has four numbers, and node ``(i, j, k)`` has the index ``(i n_y + j) n_z + k``."""
+"""Transfers between particles and grid in 3D, with the arguments of ``transfer_2d``.
+
+A grid node has four numbers, and node ``(i, j, k)`` has the index ``(i n_y + j) n_z + k``.
+"""
 
 from __future__ import annotations
 
@@ -84,7 +87,7 @@ def deform(particles, stress, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def particles_to_grid(particles, stress, grid, counts, origin, inv, h):
-    """Add momentum, stress impulse and mass of the particles to the grid."""
+    """Add momentum, impulse of the stress, and mass of the particles to ``grid``, as in ``transfer_2d``."""
     pos, vel, affine, mass, specific_volume = particles.pos, particles.vel, particles.affine, particles.mass, particles.specific_volume
     spacing, stride_x, stride_y = 1.0 / inv, counts[1] * counts[2], counts[2]
     for p in range(pos.shape[0]):
@@ -120,7 +123,7 @@ def particles_to_grid(particles, stress, grid, counts, origin, inv, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def grid_to_particles(particles, grid, counts, origin, inv, h):
-    """Interpolate velocities and their gradients from the grid, and move the particles."""
+    """Interpolate velocities and their gradients from ``grid``, and move the particles, as in ``transfer_2d``."""
     pos, vel, gradient = particles.pos, particles.vel, particles.gradient
     stride_x, stride_y = counts[1] * counts[2], counts[2]
     for p in range(pos.shape[0]):
