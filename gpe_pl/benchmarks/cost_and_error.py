@@ -122,7 +122,7 @@ def winners(points: Sequence[Point], horizons: Sequence[str]) -> list[str]:
 
 
 def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: float) -> float:
-    """Return the number of rollouts of a duration [s] after which training has paid off against a solver of the same error.
+    """Return the number of rollouts of ``duration`` [s] after which the training of a model has paid off, compared with a solver of the same error.
 
     It is infinite if training never pays off, 0 if no solver has so small an error, and NaN if the training time is not known.
     """

@@ -105,6 +105,12 @@ def solved(spec: DatasetSpec, start: State, factor: int, frames: Sequence[int]) 
 def scene_records(spec: DatasetSpec, label: str, split: Split, index: int, times: Sequence[float]) -> list[dict[str, Any]]:
     """Return records of one scene: squared distances from the reference [m²], errors of momentum [m/s], and processor time.
 
+    Args:
+        spec: data set of the scene.
+        label: name of the data set in the records.
+        split, index: split and number of the scene.
+        times: compared times after the start [s], in ascending order.
+
     Raises:
         LabelsError: a solver stopped.
     """

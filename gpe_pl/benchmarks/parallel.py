@@ -45,7 +45,10 @@ class Settings:
         num_processes: numbers of processes to compare; speed-ups are relative to the first.
         num_graphs: graphs per step, over all processes.
         num_nodes, num_edges: nodes and edges per graph.
+        num_message_passing_steps, hidden_channels: size of the model.
         num_steps: number of timed steps; the median counts.
+        num_threads: threads of PyTorch in each process.
+        accelerator: device of all processes.
     """
 
     num_processes: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [1, 2])

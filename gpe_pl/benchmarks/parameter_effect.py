@@ -125,7 +125,7 @@ def scene_changes(spec: DatasetSpec, index: int) -> dict[str, list[float]]:
 
 
 def stored_changes(spec: DatasetSpec, index: int, parts: FinishedParts) -> dict[str, list[float]]:
-    """Return ``scene_changes`` as a stopped suite stored them, or compute and store them."""
+    """Return ``scene_changes``. They are read from ``parts`` if an earlier, stopped run of the suite has stored them there; otherwise they are stored."""
     identity = {"data": spec.as_dict(), "scene": index}
     stored = parts.get(identity)
     if stored is None:

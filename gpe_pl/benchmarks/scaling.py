@@ -41,7 +41,11 @@ class Settings:
         num_nodes: sizes of the scenes.
         dimensions: dimensions of the scenes.
         fitted: range of sizes over which the exponent is fitted. Times per edge and layer are compared between its smallest and largest size.
+        num_message_passing_steps, hidden_channels, edge_state: settings of the model.
         budget: time [s] for repetitions of the graph, and as much for those of the forward pass, at one size. The fastest counts.
+        num_threads: threads of PyTorch.
+        accelerator: device of the model; graphs are built on the CPU.
+        seed: seed of the weights.
     """
 
     num_nodes: Annotated[list[Annotated[int, Field(ge=10)]], Field(min_length=1)] = field(default_factory=lambda: [1000, 10_000, 100_000])
@@ -69,7 +73,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Step:
-    """A rollout step in two parts, and its number of edges."""
+    """A rollout step in two parts: a function that builds the ``graph``, and the model's ``forward`` pass on it. ``num_edges`` is its number of edges."""
 
     graph: Callable[[], Any]
     forward: Callable[[], Any]
@@ -77,7 +81,7 @@ class Step:
 
 
 def prepare(settings: Settings, num_nodes: int, dim: int, skips: Skips | None = None) -> Step:
-    """Prepare a step on a lattice: building its graph, and the model's forward pass."""
+    """Return a step on a lattice with ``num_nodes`` nodes in ``dim`` dimensions; ``skips`` are the levels of skipping of the model."""
     torch.manual_seed(settings.seed)
     builder, state = lattice_scene(num_nodes, int(EDGES_PER_NODE[dim] * num_nodes), GraphConfig(), dim)
     graph = builder(state).to(settings.device)

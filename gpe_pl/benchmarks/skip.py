@@ -40,10 +40,16 @@ class Settings:
     """Settings of the scene and of the irrelevant parts.
 
     Attributes:
+        num_nodes, num_edges: size of the relevant scene.
+        num_message_passing_steps, hidden_channels: size of the models.
+        edge_states: settings ``edge_state`` of the compared models.
         num_boundary: number of boundary nodes out of reach.
         num_falling: number of particles in free fall without neighbours.
         num_settled: number of copies of the scene at rest, far from each other.
         repeats: numbers of frames for which one prediction is repeated.
+        num_rounds: number of rounds of measurements; the median counts.
+        num_threads: threads of PyTorch.
+        accelerator: device of the models.
         seed: seed of the weights.
     """
 

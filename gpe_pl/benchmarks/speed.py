@@ -61,6 +61,13 @@ class Settings:
     """Size of the problem, and how it is timed. Edges are counted as undirected.
 
     Attributes:
+        num_nodes, num_edges: size of the graph.
+        num_message_passing_steps, hidden_channels: size of the models.
+        num_rounds: number of rounds of measurements; the median counts.
+        num_threads: threads of PyTorch.
+        accelerator: device of the models.
+        compile: also time ``torch.compile``, if a compiler is installed.
+        seed: seed of the weights.
         cases: data sets of shipped models, by the name of the model; a rollout step of each is timed.
     """
 
@@ -82,7 +89,15 @@ class Settings:
 
 @dataclass(frozen=True)
 class Case:
-    """A model to time: a variant of GPE, or a baseline."""
+    """A model to time.
+
+    Attributes:
+        model: class of the model.
+        interaction, implementation, edge_state: settings of ``GPE``.
+        is_fused: use the fused passes for CPUs.
+        compiled: apply ``torch.compile``.
+        precision: precision of float32 products, as in ``torch.set_float32_matmul_precision``.
+    """
 
     model: Literal["GPE", "GNS", "DPINet", "ContinuousConvNet"] = "GPE"
     interaction: Interaction = "negated"
@@ -119,7 +134,7 @@ class Case:
         return None if self.is_fused else "directed, factored"
 
     def build(self, spec: FeatureSpec, num_steps: int, hidden: int, seed: int = 0) -> Model:
-        """Build the model. Cases with the same parameters get the same weights from one seed."""
+        """Build the model with ``num_steps`` layers of ``hidden`` channels. Cases with the same parameters get the same weights from one seed."""
         torch.manual_seed(seed)
         if self.model == "GNS":
             return GNS(spec, num_steps, hidden)
@@ -265,7 +280,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], trainings: dict[str, 
 
 @dataclass(frozen=True)
 class Timing:
-    """Median time of a case [s], and median of its paired ratios to the reference."""
+    """Time of a case: the median in ``seconds``, and the median ``ratio`` to the time of the reference in the same round."""
 
     seconds: float
     ratio: float

@@ -307,14 +307,14 @@ def _imported(module: str, extra: str) -> Any:
 
 @dataclass
 class ProcessLauncherConfig:
-    """Configuration node of ``hydra/launcher=processes``."""
+    """Settings of ``hydra/launcher=processes`` with their defaults; ``ProcessLauncher`` documents them."""
 
     num_processes: int | None = None
 
 
 @dataclass
 class RayLauncherConfig:
-    """Configuration node of ``hydra/launcher=ray``."""
+    """Settings of ``hydra/launcher=ray`` with their defaults; ``RayLauncher`` documents them."""
 
     address: str | None = None
     num_cpus: float = 1.0
@@ -323,7 +323,7 @@ class RayLauncherConfig:
 
 @dataclass
 class SlurmLauncherConfig:
-    """Configuration node of ``hydra/launcher=slurm``."""
+    """Settings of ``hydra/launcher=slurm`` with their defaults; ``SlurmLauncher`` documents them."""
 
     cluster: str = "slurm"
     parameters: dict[str, Any] = field(default_factory=lambda: {"timeout_min": 24 * 60})

@@ -153,7 +153,7 @@ def _text(value: Any) -> str:
 
 @dataclass
 class OptunaSweeperConfig:
-    """Configuration node of ``hydra/sweeper=optuna``."""
+    """Settings of ``hydra/sweeper=optuna`` with their defaults; ``OptunaSweeper`` documents them."""
 
     num_trials: int = 20
     num_at_once: int = 1

@@ -89,7 +89,7 @@ def block(columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def dropped_block(spec: DatasetSpec, value: float, columns: int, rows: int, gap: float, speed: float) -> State:
-    """Return a block over the middle of the floor, ``gap`` [m] above it, that moves down at a speed [m/s]."""
+    """Return a block of ``columns`` × ``rows`` squares over the middle of the floor, ``gap`` [m] above it, that moves down at ``speed`` [m/s]."""
     nodes, cells = block(columns, rows)
     pos = middle_of_floor(spec) + spec.scene.spacing * (nodes - [columns / 2, 0]) + [0, gap]
     return start(spec, value, pos, (0.0, -speed), domain_walls(spec.scene.bounds, COULOMB), cells)

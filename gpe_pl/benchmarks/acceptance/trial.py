@@ -153,7 +153,7 @@ def _both(model: Sequence[float], solver: Sequence[float], unit: str) -> tuple[s
 
 
 def at_most(name: str, values: Sequence[float], limit: float, unit: str) -> Check:
-    """Return the check that no value exceeds a limit."""
+    """Return the check ``name`` that no value exceeds ``limit``; both have the unit ``unit``."""
     return Check(name, all(v <= limit for v in values), f"{listed(values)}{unit}", "", f"at most {limit:.3g}{unit}")
 
 
@@ -216,7 +216,7 @@ def contained(name: str, trials: Sequence[Trial]) -> Check:
 
 @dataclass(frozen=True)
 class Shown:
-    """One column of a scene's figure: the solver above, the model below, at one frame."""
+    """One column of a scene's figure: under a ``title``, the solver (``truth``) above and the ``model`` below, at one frame."""
 
     title: str
     truth: Trajectory
@@ -226,7 +226,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Result:
-    """Checks of a scene and the columns of its figure."""
+    """Result of a scene: its ``checks``, and the columns of its figure (``shown``)."""
 
     checks: list[Check]
     shown: list[Shown]

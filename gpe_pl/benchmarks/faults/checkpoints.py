@@ -1,4 +1,7 @@
-"""Faults of checkpoints: damaged files, files of another model, and files that carry code."""
+"""Faults of checkpoints: damaged files, files of another model, and files that carry code.
+
+The functions ``load_…`` write a faulty checkpoint, made from the ``sound`` one, into the empty folder ``folder``. They load it and return the verdict.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +75,7 @@ OTHER_MODELS: tuple[tuple[str, Any], ...] = (
 
 
 def load_changed(sound: Path, key: str, value: Any, folder: Path) -> Verdict:
-    """Load a checkpoint with a changed entry of its description."""
+    """Load a checkpoint in whose description the entry ``key`` is replaced by ``value``."""
     stored = torch.load(sound, weights_only=True)
     description = stored["simulator"]
     changed = {**description[key], **value} if isinstance(value, dict) and isinstance(description[key], dict) else value
@@ -80,7 +83,7 @@ def load_changed(sound: Path, key: str, value: Any, folder: Path) -> Verdict:
 
 
 def load_without(sound: Path, key: str, folder: Path) -> Verdict:
-    """Load a checkpoint without a weight, without all weights, or without the description."""
+    """Load a checkpoint without ``key``: the name of a weight, ``state_dict`` (all weights), or ``simulator`` (the description)."""
     stored = torch.load(sound, weights_only=True)
     if key in stored:
         del stored[key]
@@ -95,7 +98,7 @@ def load_content(content: Any, folder: Path) -> Verdict:
 
 
 def load_not_finite(sound: Path, key: str, value: float, folder: Path) -> Verdict:
-    """Load a checkpoint with a weight that is not finite."""
+    """Load a checkpoint in which a number of the weight ``key`` is replaced by ``value``, which is not finite."""
     stored = torch.load(sound, weights_only=True)
     stored["state_dict"][key].view(-1)[0] = value
     return _load_saved(stored, folder)
@@ -139,7 +142,7 @@ PLACES = ("whole", "description", "settings", "weights", "optimizer", "key", "pi
 
 
 def load_hostile(sound: Path, kind: str, place: str, folder: Path) -> Verdict:
-    """Load a checkpoint that contains code."""
+    """Load a checkpoint that contains code of a ``kind`` (see ``payload``) at a ``place``, such as ``whole`` or ``settings``."""
     code, path = payload(kind, folder), folder / "hostile.ckpt"
     stored = torch.load(sound, weights_only=True)
     if place == "whole":

@@ -67,7 +67,16 @@ def mutations(key: str, value: Any) -> Iterator[tuple[str, str, bool]]:
 
 
 def started(command: str, arguments: Sequence[str], override: str, must_fail: bool, limit: float, folder: Path) -> Verdict:
-    """Start a command with one additional override, and return the verdict."""
+    """Start a command with one additional override, and return the verdict.
+
+    Args:
+        command: name of the command.
+        arguments: its other arguments.
+        override: the additional override.
+        must_fail: whether the command has to refuse it.
+        limit: time [s] after which the command is stopped.
+        folder: folder of its results.
+    """
     ended = run(command, [*arguments, f"paths.runs={folder}", override], limit)
     verdict = ended.verdict("accepted" if must_fail else "harmless")
     if verdict.status in ("refused", "harmless") and list(folder.rglob("*.part*")):

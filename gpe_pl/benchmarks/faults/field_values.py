@@ -1,4 +1,8 @@
-"""Faults of stored values. Values that break the rules of their fields enter by training, evaluation, validation, import and rollout."""
+"""Faults of stored values. Values that break the rules of their fields enter by training, evaluation, validation, import and rollout.
+
+The functions of these five ways have the same arguments. They take the first trajectory of ``shard``, put ``value`` at a random place (``seed``) into the array
+``key``, write to the empty folder ``folder`` if they need files, and return the message that refuses the trajectory. It is empty if nothing refuses it.
+"""
 
 from __future__ import annotations
 
@@ -63,32 +67,32 @@ def spoilt(arrays: dict[str, np.ndarray], key: str, value: Value, seed: int) -> 
 
 
 def train(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """Read the data as training does. Return the message about a trajectory that is left out, or about the whole split."""
+    """Read the changed trajectory as training does, and return the message about it or about the whole split."""
     _store(shard, key, value, seed, folder)
     return _left_out(lambda: [stored.name for stored in usable(open_split(folder, "train"))])
 
 
 def evaluate(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """Read the data as evaluation does, and return its message."""
+    """Read the changed trajectory as evaluation does, and return the message."""
     _store(shard, key, value, seed, folder)
     return _left_out(lambda: [trajectory.metadata.dataset for trajectory in long_enough(folder, "train", 2)])
 
 
 def check(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """Return the message of the validator."""
+    """Validate the changed trajectory, and return the message."""
     found = validate([_store(shard, key, value, seed, folder)]).violations
     return "; ".join(str(v) for v in found if v.trajectory == FIRST)
 
 
 def convert(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """Convert a data set of this trajectory and a sound one; return the message about the refused trajectory."""
+    """Convert a data set of the changed trajectory and a sound one, and return the message about the changed one."""
     sound, arrays = _sound(shard)
     report = save_dataset(folder, "own", train=[_trajectory(sound, spoilt(arrays, key, value, seed)), sound, sound, sound])
     return "; ".join(event.what for event in report.refusals if event.trajectory == "train[0]")
 
 
 def roll_out(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """Return the reason why a learned simulator does not start from this trajectory."""
+    """Start a learned simulator from the changed trajectory, and return the reason why it stops."""
     sound, arrays = _sound(shard)
     trajectory = _trajectory(sound, spoilt(arrays, key, value, seed))
     simulator = small_model(sound.metadata)
@@ -108,7 +112,7 @@ OF_STATES = ("node_type", "mass", "material_params", "boundary_", "rest_pos", "c
 
 
 def brought_in(way: str, shard: Path, key: str, value: Value, seed: int, folder: Path) -> Verdict:
-    """Let a wrong value enter in one way. The message must name the field; without a message, the value was accepted."""
+    """Let a wrong value enter by one of ``WAYS`` and return the verdict. The message must name the field; without a message, the value was accepted."""
     try:
         text = WAYS[way](shard, key, value, seed, folder)
     except GpeError as error:

@@ -1,4 +1,7 @@
-"""Faults with names, links and checkpoints that point out of the folders of a command."""
+"""Faults with names, links and checkpoints that point out of the folders of a command.
+
+Commands run in the empty folder ``folder``, for at most ``limit`` seconds. ``sound`` is the folder of an undisturbed run.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +24,13 @@ LEADING_OUT = ("../../canary", "a/../../../canary", "{canary}", "file://{canary}
 
 
 def named(command: Command, key: str, name: str, limit: float, folder: Path) -> Verdict:
-    """Give a command a name that leads outside; it must refuse the name."""
+    """Give a command a ``name`` that leads outside, as the value of the setting ``key``; it must refuse the name."""
     override = f"{key}='{name.replace('{canary}', str(folder.parent / CANARY))}'"
     return isolation.run(command.module, [*command.given(folder / "own"), override], limit).verdict("accepted")
 
 
 def linked(command: Command, sound: Path, part: str, target: str, limit: float, folder: Path) -> Verdict:
-    """Replace a part of a command's results by a link that leads outside, and repeat the command."""
+    """Replace a ``part`` of a command's results by a link to ``target`` in a folder outside, and repeat the command."""
     own = folder / "own"
     shutil.copytree(sound, own)
     path = own / part

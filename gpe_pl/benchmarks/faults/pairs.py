@@ -1,4 +1,7 @@
-"""Faults of concurrency: two commands at once in one folder, and folders that are deleted under a running command."""
+"""Faults of concurrency: two commands at once in one folder, and folders that are deleted under a running command.
+
+Commands run in the empty folder ``folder``, each for at most ``limit`` seconds. ``expected`` are the digests of results of undisturbed commands.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +65,9 @@ def together(commands: Sequence[Command], expected: Sequence[Results], delay: fl
 
 
 def deleted(command: Command, part: str, delay: float, expected: Results, limit: float, folder: Path) -> Verdict:
-    """Delete the folder of the data or of the results while a command runs; it must fail with an error or succeed, and its repetition must succeed.
+    """Delete a ``part`` of a command's folder, ``data`` or ``runs``, ``delay`` seconds after its start.
+
+    The command must fail with an error or succeed, and its repetition must succeed.
 
     If the data are to be deleted, the command works on a copy of them and generates them again if they are missing.
     """

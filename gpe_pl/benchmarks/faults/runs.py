@@ -1,4 +1,8 @@
-"""Faults of runs. Commands are killed, run out of disk space or find damaged files; then the same command runs again."""
+"""Faults of runs. Commands are killed, run out of disk space or find damaged files; then the same command runs again.
+
+Commands run in the empty folder ``folder``, each for at most ``limit`` seconds. ``sound`` is the folder of an undisturbed run, and ``expected`` are the digests
+of its results (``digests``).
+"""
 
 from __future__ import annotations
 
@@ -159,7 +163,7 @@ def _final_files(folder: Path) -> list[Path]:
 
 
 def finished(command: Command, folder: Path, expected: dict[str, str], limit: float, stays: frozenset[str] = frozenset()) -> Verdict:
-    """Run a command to its end, and compare its results; names in ``stays`` may be left over."""
+    """Run a command to its end, and compare its results with ``expected``. Files named in ``stays`` may be left over."""
     ended = isolation.run(command.module, command.given(folder), limit)
     verdict = ended.verdict()
     may_be_done = command.module in ONCE and verdict.status == "refused"
@@ -185,7 +189,8 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: int = 0, limit: float = 600.0) -> Iterator[Verdict]:
     """Kill a command at random moments, with SIGKILL, SIGTERM and SIGINT in turn, start it again, and after some kills let it finish.
 
-    The final results are compared with those of an undisturbed run. Yield a verdict per kill, which names the moment.
+    The final results are compared with those of an undisturbed run. Yield a verdict for each of ``count`` kills, which names its time. A run is killed at most
+    ``in_a_row`` times before it may finish.
     """
     rng = np.random.default_rng(seed)
     whole = folder / "whole"
@@ -240,7 +245,7 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
 
 
 def damaged_file(command: Command, sound: Path, name: str, damage: Callable[[bytes], bytes], limit: float, folder: Path) -> Verdict:
-    """Damage a file that a command has left, and repeat the command: it must refuse, or give sound results."""
+    """Damage the file ``name`` among the results of a command, and repeat the command. It must refuse, or give sound results."""
     return changed_file(command, sound, name, partial(_damaged_bytes, damage), limit, folder)
 
 
@@ -249,7 +254,7 @@ def _damaged_bytes(damage: Callable[[bytes], bytes], path: Path) -> None:
 
 
 def changed_file(command: Command, sound: Path, name: str, change: Callable[[Path], None], limit: float, folder: Path) -> Verdict:
-    """Change or replace a file that a command has left, and repeat the command, as in ``damaged_file``."""
+    """Change or replace the file ``name`` among the results of a command, and repeat the command, as in ``damaged_file``."""
     for part in sound.iterdir():
         (shutil.copytree if part.is_dir() else shutil.copy)(part, folder / part.name)
     change(folder / name)
@@ -270,7 +275,7 @@ def _have_equal_content(sound: Path, damaged: Path) -> bool:
 
 
 def damage_faults(command: Command, sound: Path, count: int, seed: int, limit: float) -> list[Fault]:
-    """Return damages to files that a command has left in a folder, other than pictures and logs."""
+    """Return ``count`` random damages to files among the results of a command, other than pictures and logs."""
     rng = np.random.default_rng(seed)
     names = sorted(digests(sound))
     kinds = list(stores.damages(4 * count, seed))
@@ -309,7 +314,10 @@ def small_disk(folder: Path, size: int) -> Iterator[bool]:
 
 
 def full_disk(command: Command, size: int, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
-    """Run a command on a disk that fills up; then make room, and run the same command to its end. Without the right to mount, files are limited instead."""
+    """Run a command on a disk of ``size`` bytes, which fills up. Then make room, and run the same command to its end.
+
+    Without the right to mount a disk, the size of single files is limited instead.
+    """
     with small_disk(folder / "disk", size) as is_mounted:
         own = folder / "disk"
         prepare = None if is_mounted else partial(limit_file_size, size)
@@ -327,7 +335,7 @@ def full_disk(command: Command, size: int, expected: dict[str, str], limit: floa
 
 
 def file_limit(command: Command, size: int, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
-    """Run a command with a limited file size, as in ``full_disk``."""
+    """Run a command while no file may exceed ``size`` bytes; then run it again without this limit, as in ``full_disk``."""
     verdict = isolation.run(command.module, command.given(folder), limit, partial(limit_file_size, size)).verdict()
     if verdict.status != "refused":
         return verdict

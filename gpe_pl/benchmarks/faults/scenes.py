@@ -82,7 +82,7 @@ WRONG = {
 
 
 def simulated(spec: DatasetSpec, name: str, learned: bool, seed: int, folder: Path) -> Verdict:
-    """Run some steps of a changed scene with the data set's solver, or with a model with random weights."""
+    """Run some steps of a scene with the change ``name``, by the data set's solver or, if ``learned``, by a model with random weights. Return the verdict."""
     state = CHANGES[name](initial_state(spec, "test", seed % spec.counts["test"]), np.random.default_rng(seed))
     metadata = trajectory_metadata(spec, "test", 0)
     return verdict_of(lambda: _rolled_out(spec, state, metadata, learned), lambda result: name not in WRONG and _is_finite(result))

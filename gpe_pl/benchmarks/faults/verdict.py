@@ -30,7 +30,7 @@ MAX_DETAIL = 300
 
 @dataclass(frozen=True)
 class Verdict:
-    """Outcome of a fault: a status, and the message or reason."""
+    """Outcome of a fault: a ``status``, and the message or reason as ``detail``."""
 
     status: Status
     detail: str = ""

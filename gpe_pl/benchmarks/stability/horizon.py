@@ -179,7 +179,16 @@ def perturbation(subject: Subject) -> Outcome:
 
 
 def separation(simulator: Simulator, state: State, num_steps: int, spacing: float, size: float, seed: int = 0) -> np.ndarray:
-    """Return the root mean square distance [spacings] per frame of two rollouts whose initial positions differ by ``PERTURBATION`` times ``size`` [m]."""
+    """Return the root mean square distance [spacings] in each frame of two rollouts whose initial positions differ by ``PERTURBATION`` times ``size`` [m].
+
+    Args:
+        simulator: simulator of both rollouts.
+        state: initial state of the first.
+        num_steps: length of the rollouts.
+        spacing: rest spacing [m].
+        size: longest side of the domain [m].
+        seed: seed of the random directions in which nodes are displaced.
+    """
     noise: Any = np.random.default_rng(seed).normal(size=tuple(state.pos.shape))
     noise *= PERTURBATION * size / np.sqrt(np.square(noise).sum(axis=-1).mean())
     is_torch = isinstance(state.pos, torch.Tensor)

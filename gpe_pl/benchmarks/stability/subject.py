@@ -119,7 +119,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class StressTest:
-    """A numbered test with its criterion."""
+    """A stress test: its ``number`` and ``name``, its ``criterion`` in words, and the function ``run`` that tests a subject."""
 
     number: int
     name: str
