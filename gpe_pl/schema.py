@@ -24,7 +24,7 @@ HISTORY = 5
 
 @dataclass(frozen=True)
 class Limits:
-    """Smallest and largest value of a material parameter that the solvers accept, in the unit of the parameter."""
+    """Smallest (``low``) and largest value (``high``) of a material parameter that the solvers accept, in the unit of the parameter."""
 
     low: float
     high: float

@@ -356,7 +356,15 @@ class Unroll:
 
 
 def training_graph(builder: GraphBuilder, state: State, target: Tensor, stress: Tensor | None, about: dict[str, Any]) -> HeteroData:
-    """Create the graph of a state with the targets of each node: ``target`` [node, dim] in m/s² and, if given, ``stress_target`` [node, component] in Pa."""
+    """Create the graph of a state, with targets for each node in the stores of materials.
+
+    Args:
+        builder: builder of the graph.
+        state: state of the scene.
+        target: acceleration without gravity [node, dim] in m/s²; stored as ``target``.
+        stress: Cauchy stress after the step [node, component] in Pa; stored as ``stress_target``. None stores none.
+        about: further attributes of the graph.
+    """
     data = builder(state)
     for material in builder.spec.materials:
         data[material].target = target.to(builder.precision)[data[material].node_id]

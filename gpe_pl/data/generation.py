@@ -152,10 +152,10 @@ def plan(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) ->
 
 
 def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, part: tuple[int, int] = (0, 1)) -> None:
-    """Delete shards and statistics that do not agree with their checksums, so that ``generate`` creates them again.
+    """Delete shards and statistics that do not agree with their checksums, so that ``generate`` creates them again. Arguments and errors are those of
+    ``generate``.
 
-    Each deleted file is logged. If nothing is damaged, nothing is written. Reading a data set takes about a twentieth of the time to generate it. Arguments and
-    errors are those of ``generate``.
+    Each deleted file is logged. If nothing is damaged, nothing is written. Reading a data set takes about a twentieth of the time to generate it.
     """
     folder = Path(root) / spec.name / spec.size
     paths = [path for shard in _shards(spec, part) if (path := shard_path(folder, *shard)).is_file()]

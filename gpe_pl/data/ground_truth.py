@@ -322,7 +322,13 @@ def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
 
 
 def initial_state(spec: DatasetSpec, split: str, index: int, values: Mapping[str, MaterialValues] | None = None) -> State:
-    """Sample the initial state of one trajectory, optionally with other parameter values: a number for one parameter, several by name.
+    """Return the initial state of one trajectory.
+
+    Args:
+        spec: the data set.
+        split, index: split and number of the trajectory.
+        values: other parameters of each material: a number for a material with one stored parameter, otherwise parameters by name. None takes the values of
+            the data set.
 
     Raises:
         GenerationError: the scene is impossible, or ``values`` are not those of all stored parameters.
@@ -337,9 +343,13 @@ def initial_state(spec: DatasetSpec, split: str, index: int, values: Mapping[str
 def generate_trajectory(
     spec: DatasetSpec, split: str, index: int, values: Mapping[str, MaterialValues] | None = None, num_frames: int | None = None
 ) -> Trajectory:
-    """Simulate one trajectory, optionally with other parameter values or another number of frames.
+    """Simulate one trajectory.
 
-    Values are a number for a material with one stored parameter, otherwise parameters by name.
+    Args:
+        spec: the data set.
+        split, index: split and number of the trajectory.
+        values: other parameters of each material, as in ``initial_state``.
+        num_frames: number of frames, the initial one included; None takes that of the data set.
 
     Raises:
         GenerationError: the scene is impossible, ``values`` are not those of all stored parameters, or the simulation stopped early.

@@ -169,7 +169,7 @@ class Group:
 
 @dataclass
 class Result:
-    """Violations, and summaries of the trajectories without violations by data set and split."""
+    """Result of a validation: ``violations``, and summaries (``groups``) of the trajectories without violations, by data set and split."""
 
     violations: list[Violation] = field(default_factory=list)
     groups: dict[tuple[str, str], Group] = field(default_factory=dict)

@@ -32,7 +32,18 @@ class MetricsError(GpeError, ValueError):
 
 @dataclass(frozen=True)
 class Row:
-    """One number of ``metrics.csv``. A metric of a whole split has the trajectory -1, no parameter group and the parameter NaN."""
+    """One number of ``metrics.csv``.
+
+    Attributes:
+        model: label of the model or baseline.
+        split: split of the data set.
+        trajectory: number of the trajectory in the split; -1 for a metric of the whole split.
+        parameter_group: one of ``GROUPS``.
+        parameter: first material parameter of the scene; NaN for a metric of the whole split.
+        metric: name of the metric.
+        horizon: label of the horizon; empty for metrics without one.
+        value: value of the metric.
+    """
 
     model: str
     split: str

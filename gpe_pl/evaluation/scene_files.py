@@ -35,7 +35,10 @@ def check_formats(formats: list[Export]) -> None:
 
 
 def write_pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predictions: dict[str, Trajectory]) -> None:
-    """Write a figure, an animation and a viewer of a scene to ``run_dir``, and a figure of the stress if all trajectories have one."""
+    """Write a figure, an animation and a viewer of a scene to ``run_dir``, and a figure of the stress if all trajectories have one.
+
+    ``split`` and ``number`` of the scene are part of the files' names. ``predictions`` are rollouts by model.
+    """
     from gpe_pl.viz.figures import rollout_figure
     from gpe_pl.viz.video import write_animation
     from gpe_pl.viz.viewer import write_viewer
@@ -59,7 +62,10 @@ def write_parameter_picture(path: Path, scenes: list[AtValue]) -> None:
 
 
 def write_exports(run_dir: Path, split: str, number: int, truth: Trajectory, prediction: Trajectory, formats: list[Export]) -> None:
-    """Write the ground truth and the rollout of a scene to ``run_dir``, in those of the formats that hold trajectories."""
+    """Write the ground truth and the rollout of a scene to ``run_dir``, in those of the ``formats`` that hold trajectories.
+
+    ``split`` and ``number`` of the scene are part of the files' names.
+    """
     from gpe_pl.export.trajectories import write_npz, write_vtk
     from gpe_pl.viz.video import write_animation
 

@@ -61,7 +61,7 @@ class ShowcaseSettings:
 
 @dataclass(frozen=True)
 class Record:
-    """One measured value with its unit."""
+    """A measured quantity: name of the ``metric``, ``value`` and ``unit``."""
 
     metric: str
     value: float

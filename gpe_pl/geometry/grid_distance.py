@@ -2,8 +2,8 @@
 
 The surface is given by heights of the ground, by triangles or by oriented points. The last axis points up.
 
-A grid is given by the position ``low`` of its first node [m], its ``spacing`` [m] and its numbers of nodes along x, y and z, ``counts``. Arrays of distances
-have the shape ``counts``.
+All functions describe a grid by the position ``low`` of its first node [m], its ``spacing`` [m] and its numbers of nodes along x, y and z, ``counts``. Arrays
+of distances have the shape ``counts``.
 """
 
 from __future__ import annotations

@@ -125,6 +125,7 @@ class Wall:
         normal: unit normal into free space, along one axis.
         offset: position of the plane along the normal [m].
         low, high: corners of the domain [m]; the wall is sampled between them.
+        friction, restitution: as in ``Shape``.
     """
 
     normal: tuple[float, ...]
@@ -155,7 +156,7 @@ class Wall:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A solid disc (2D) or ball (3D)."""
+    """A solid disc (2D) or ball (3D), given by ``center`` [m] and ``radius`` [m]; ``friction`` and ``restitution`` as in ``Shape``."""
 
     center: tuple[float, ...]
     radius: float
@@ -177,7 +178,10 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Bowl:
-    """A closed spherical (2D: circular) container. Everything outside of it is solid."""
+    """A closed spherical (2D: circular) container. Everything outside of it is solid.
+
+    ``center`` and ``radius`` are in m; ``friction`` and ``restitution`` are as in ``Shape``.
+    """
 
     center: tuple[float, ...]
     radius: float
@@ -199,7 +203,7 @@ class Bowl:
 
 @dataclass(frozen=True)
 class Box:
-    """A solid axis-aligned box."""
+    """A solid box along the axes between the corners ``low`` and ``high`` [m]; ``friction`` and ``restitution`` as in ``Shape``."""
 
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -273,7 +277,11 @@ def _require_simple(vertices: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Polygon:
-    """A solid simple polygon (2D), vertices in counter-clockwise order [m].
+    """A solid simple polygon (2D).
+
+    Attributes:
+        vertices: corners in counter-clockwise order [m].
+        friction, restitution: as in ``Shape``.
 
     Raises:
         ValueError: there are fewer than 3 vertices, edges touch or have no length, or the vertices run clockwise.
@@ -340,6 +348,7 @@ class DistanceGrid:
         counts: number of nodes along each axis, at least 2.
         encoded: the distances [m] as base64 text of zlib-compressed bytes. The bytes are little-endian float32 in C order, rearranged so that all first
             bytes come before all second bytes, and so on. ``from_values`` creates it.
+        friction, restitution: as in ``Shape``.
 
     Raises:
         ValueError: a size is invalid, sizes do not fit together, or ``encoded`` is damaged.
@@ -368,7 +377,13 @@ class DistanceGrid:
     def from_values(
         cls, origin: Sequence[float] | np.ndarray, spacing: float, values: np.ndarray, friction: float, restitution: float = 0.0
     ) -> DistanceGrid:
-        """Create a grid from signed distances [node along x, node along y(, node along z)] in m, rounded to about 1/4096 of ``spacing``.
+        """Create a grid from signed distances. They are rounded to about 1/4096 of ``spacing``.
+
+        Args:
+            origin: position of the first node [m].
+            spacing: distance of neighbouring nodes along each axis [m].
+            values: signed distances [node along x, node along y(, node along z)] in m.
+            friction, restitution: as in ``Shape``.
 
         Raises:
             ValueError: an axis has fewer than 2 nodes, there are too many nodes, values are not finite, or there are not 2 or 3 axes.

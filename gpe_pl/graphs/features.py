@@ -215,7 +215,7 @@ def virtual_features(
 ) -> Tensor:
     """Return features of virtual nodes [node, (history + 1) · dim + 1].
 
-    They are the features of material nodes and the level, which is log₂ of the node's width over the rest spacing.
+    They are the features of material nodes (``material_features``) and the level, which is log₂ of the width of the node's box over the rest spacing.
     """
     return torch.cat([material_features(velocity_history, gravity, scales), level[:, None].double()], dim=1)
 

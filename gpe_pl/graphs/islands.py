@@ -83,7 +83,14 @@ def islands_within(
 ) -> Islands:
     """Return the islands of nodes that lie within a radius [m] of each other or that mesh edges connect.
 
-    An island is free if no boundary node lies within the radius. ``boundary`` is the positions of boundary nodes [m], or ``Points`` of them.
+    An island is free if no boundary node lies within the radius.
+
+    Args:
+        radius: largest distance of connected nodes [m].
+        pos: positions of dynamic nodes [m].
+        boundary: positions of boundary nodes [m], or ``Points`` of them.
+        mesh_edges: edges of meshes, which connect their nodes at any distance.
+        periodicity: axes along which space repeats.
     """
     points, touches = Points(pos, radius, periodicity), np.zeros(len(pos), dtype=bool)
     touches[radius_between(boundary, points, radius, periodicity)[1]] = True

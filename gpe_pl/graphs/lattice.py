@@ -19,7 +19,7 @@ from gpe_pl.trajectory.trajectory import Metadata
 def lattice_scene(num_nodes: int, num_edges: int, config: GraphConfig, dim: int = 2, seed: int = 0) -> tuple[GraphBuilder, State]:
     """Return a builder and a state with about ``num_edges`` undirected edges between ``num_nodes`` nodes in a unit square or cube.
 
-    Nodes are in random order, as after a long simulation.
+    Nodes are in random order, as after a long simulation. ``seed`` determines the order and the jitter of positions.
     """
     rng = np.random.default_rng(seed)
     side = int(np.ceil(num_nodes ** (1 / dim)))
@@ -50,7 +50,7 @@ def lattice_scene(num_nodes: int, num_edges: int, config: GraphConfig, dim: int 
 
 
 def lattice_graph(num_nodes: int, num_edges: int, config: GraphConfig, dim: int = 2, seed: int = 0) -> tuple[GraphBuilder, HeteroData]:
-    """Return the builder and the graph of ``lattice_scene``."""
+    """Return the builder and the graph of ``lattice_scene``, which has the same arguments."""
     builder, state = lattice_scene(num_nodes, num_edges, config, dim, seed)
     return builder, builder(state)
 

@@ -160,7 +160,7 @@ def _moving_bodies(graph: MultiscaleGraph, kind: bytes, spacing: float) -> Int64
 
 
 def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: int, periodicity: Periodicity = NOWHERE) -> MultiscaleGraph:
-    """Return ``multiscale_graph`` without using the cache."""
+    """Do the same as ``multiscale_graph`` without the cache."""
     num_nodes = len(rest_pos)
     bad = np.flatnonzero(((cells < 0) | (cells >= num_nodes)).any(axis=1))
     if len(bad):

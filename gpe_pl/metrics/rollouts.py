@@ -64,7 +64,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Interval:
-    """A statistic with its confidence interval."""
+    """A statistic (``estimate``) with the ends of its confidence interval (``low`` and ``high``)."""
 
     estimate: float
     low: float
@@ -146,7 +146,9 @@ def energy_distance(
     mass_a: Float[np.ndarray, "node_a"],
     mass_b: Float[np.ndarray, "node_b"],
 ) -> float:
-    """Return the energy distance [m] between two clouds of particles with mass: ``2 E|A - B| - E|A - A'| - E|B - B'|``.
+    """Return the energy distance [m] between two clouds of particles, ``2 E|A - B| - E|A - A'| - E|B - B'|``.
+
+    A and A' are the positions ``a`` [m] of particles drawn with probabilities in proportion to the masses ``mass_a`` [kg]; B and B' likewise.
 
     The distance compares distributions of material, not single particles. It therefore stays meaningful after chaotic motion has made errors of single
     particles meaningless. It is zero only for equal distributions. The value is exact; unlike a Sinkhorn divergence, it needs no smoothing length and no
@@ -341,7 +343,8 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
 
 
 class OneStepNMSE(Metric):
-    """One-step error without noise, ``sum |prediction - target|² / sum |target|²``. A perfect model has 0; predicting zero gives 1.
+    """Normalised mean squared one-step error, ``sum |prediction - target|² / sum |target|²`` over all nodes. It is 0 for a perfect model and 1 if zero is
+    predicted.
 
     Unlike a training loss it does not depend on the training noise, so models trained with different noise can be compared.
     """

@@ -40,7 +40,7 @@ Relations = list[EdgeType]
 
 
 class Stage(nn.Module):
-    """Encoders and propagators of one kind of stage."""
+    """Networks of one kind of stage: the encoders Enc_p and Enc_r, and the propagators P_p and P_r."""
 
     def __init__(self, node_channels: int, edge_channels: int, hidden_channels: int) -> None:
         super().__init__()
@@ -55,7 +55,13 @@ class Stage(nn.Module):
     def forward(self, x: Tensor, h: Tensor, index: Tensor, features: Tensor, receivers: slice, num_steps: int) -> Tensor:
         """Return the effects [node, hidden] after ``num_steps`` propagations along directed edges. Only the rows ``receivers`` change.
 
-        Products with the encoded inputs are the same in every step, so they are computed once.
+        Args:
+            x: features of nodes [node, channel].
+            h: effects before the stage [node, hidden].
+            index: source (row 0) and target (row 1) of each edge [2, edge]; targets are among the receivers.
+            features: features of edges [edge, channel].
+            receivers: rows of the receiving nodes.
+            num_steps: number of propagations. Products with encoded inputs are the same in all of them and are computed once.
         """
         codes = self.relation_encoder_out(self.relation_encoder_in(features, x, index))
         of_relation = self.relation_propagator.edges(codes)

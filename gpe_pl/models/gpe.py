@@ -108,7 +108,14 @@ class PairForce(nn.Module):
     def forward(
         self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, odd: Tensor, even: Tensor, chunk: int | None = None
     ) -> Float[Tensor, "edge dim"]:
-        """Return the force on the target of every edge; the opposite force acts on the source. Forces are computed for ``chunk`` edges at a time."""
+        """Return the force on the target of every edge; the opposite force acts on the source.
+
+        Args:
+            h_source, h_target: final states of the nodes at both ends [node, hidden]; one tensor within a type.
+            edge_index: source (row 0) and target (row 1) of each edge.
+            odd, even: features of the edges [edge, channel].
+            chunk: number of edges for which forces are computed at a time; None takes all at once.
+        """
         a, b = self.lin_target(h_target), self.lin_source(h_source)
         if chunk is None:
             return self._force(a, b, edge_index, odd, even)

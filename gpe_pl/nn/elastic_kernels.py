@@ -366,7 +366,10 @@ def pull_back(
     pair_start, number,
     grad_pos, grad_vel, grad_forcing, grad_lam, grad_mu, grad_eta, grad_gap, grad_friction,
 ):  # fmt: skip
-    """Propagate the gradients of displacement and last velocity to the inputs, substep by substep, last first."""
+    """Propagate the gradients of displacement (``grad``) and last velocity (``grad_last``) to the inputs, substep by substep, last first.
+
+    ``grad_pos`` to ``grad_friction`` are results. ``path``, ``speed_path``, ``pushed`` and ``contacts`` are results of ``move_forward``.
+    """
     dim = path.shape[2]
     per_mass, to_pos, to_vel, to_start = np.empty_like(grad), np.empty_like(grad), np.empty_like(grad), np.zeros_like(grad)
     for s in range(number.shape[0]):

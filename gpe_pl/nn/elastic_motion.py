@@ -223,7 +223,10 @@ def plain_motion(
     cells: Cells,
     number: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return displacement and velocity of ``elastic_motion`` by PyTorch's operations. Scenes with fewer substeps than others stop earlier."""
+    """Return displacement [m] and last velocity [m/frame] as ``elastic_motion`` does, by PyTorch's operations.
+
+    The arguments are the fields of its arguments. ``number`` has the number of substeps of each scene; a scene with fewer than others stops earlier.
+    """
     own = number.repeat_interleave(cells.node_start.diff(), output_size=len(pos))
     step = (1.0 / own.double())[:, None]
     rounds = [torch.from_numpy(some).to(pos.device) for some in _in_rounds(pair, len(pos))]

@@ -47,7 +47,7 @@ class Relation:
 
 
 class Conv(NamedTuple):
-    """Parameters of the messages of a relation: [A B W], b, p, C and c."""
+    """Parameters of the messages of a relation, in the order of the fields: [A B W], b, p, C and c of the module's equations."""
 
     weight: Tensor
     bias: Tensor
@@ -57,7 +57,7 @@ class Conv(NamedTuple):
 
 
 class Update(NamedTuple):
-    """Parameters that update the nodes of one type: Q, q, p, R and r of the module's equations, then weight and bias of the LayerNorm (None without one)."""
+    """Parameters that update the nodes of one type, in the order of the fields: Q, q, p, R and r of the equations; weight and bias of the LayerNorm."""
 
     weight: Tensor
     bias: Tensor
@@ -70,7 +70,12 @@ class Update(NamedTuple):
 
 @dataclass(frozen=True)
 class Step:
-    """A step: parameters of the relations that send messages in it, and of the types of nodes that are updated, by their numbers."""
+    """Parameters of one message-passing step.
+
+    Attributes:
+        convs: parameters of the relations that send messages in this step, by number of the relation.
+        updates: parameters of the types of nodes that are updated, by number of the type.
+    """
 
     convs: dict[int, Conv]
     updates: dict[int, Update]
@@ -210,7 +215,7 @@ def _degrees(relation: Relation, sizes: list[int]) -> dict[int, np.ndarray]:
 
 
 def plain_processor(relations: Sequence[Relation], steps: Sequence[Step], eps: float, h: Sequence[Tensor]) -> list[Tensor]:
-    """Return the result of ``fused_processor`` by PyTorch's operations, for comparison and for second derivatives."""
+    """Do the same as ``fused_processor`` with PyTorch's operations, for comparison and for second derivatives."""
     h = [*h]
     for step in steps:
         total = {t: torch.zeros_like(h[t]) for t in step.updates}

@@ -65,7 +65,15 @@ def rigid_part(
     body: Int64[Tensor, " node"],
     count: int,
 ) -> Float[Tensor, "node dim"]:
-    """Return the rigid part of accelerations for each of ``count`` bodies: it carries all of their linear and angular momentum and no deformation."""
+    """Return the rigid part of the accelerations of nodes, body by body. It has all of the body's linear and angular momentum, and deforms nothing.
+
+    Args:
+        acceleration: accelerations, in any unit.
+        mass: masses [kg].
+        pos: positions [m].
+        body: body of each node.
+        count: number of bodies.
+    """
     if _compiles(acceleration, mass, pos):
         rest = acceleration.clone()
         _remove(rest, mass, pos, body, torch.ones(count, dtype=torch.bool), angular=True)

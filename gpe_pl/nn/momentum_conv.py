@@ -91,12 +91,17 @@ class MomentumConv(MessagePassing):
     ) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """Return the sums of messages at the target nodes and at the source nodes, and the new edge states e_ij + m_ij.
 
-        New edge states need as many channels as the messages. In a relation of one type with itself, pass the same tensor twice: the first result then
-        contains the sums at both ends, and the second is None. Without ``update_edges`` the new states are None, and the last linear map is applied after the
-        sum, once per node instead of once per edge (the two commute).
+        In a relation of one type with itself, the first result contains the sums at both ends, and the second is None.
 
-        Two arguments save memory in inference. With ``edges_at_once``, intermediate results exist for this many edges at a time. With ``overwrites``, new
-        edge states may reuse the memory of the old ones.
+        Args:
+            h_source, h_target: states of the nodes at both ends. Pass the same tensor twice in a relation of one type with itself.
+            edge_index: source (row 0) and target (row 1) of each edge.
+            e: states of the edges; for ``directed``, those of one direction after those of the other.
+            s: even features of the edges.
+            update_edges: return new edge states, which need as many channels as the messages. Otherwise they are None, and the last linear map is applied
+                after the sum, once per node instead of once per edge (the two commute).
+            edges_at_once: number of edges for which intermediate results exist at a time, to save memory in inference. None takes all at once.
+            overwrites: in inference, new edge states may reuse the memory of ``e``.
         """
         size, is_joint = (h_source.shape[0], h_target.shape[0]), h_source is h_target
         if self._is_fused(h_source, h_target, e):
@@ -186,7 +191,7 @@ class MomentumConv(MessagePassing):
     def message(
         self, a_i: MaybeTensor, a_j: MaybeTensor, b_i: MaybeTensor, b_j: MaybeTensor, e: Tensor, s: MaybeTensor
     ) -> tuple[Tensor, MaybeTensor]:
-        """Return φ(z_ij), and φ(z_ji) if the interaction needs it."""
+        """Return φ(z_ij), and φ(z_ji) if the interaction needs it. PyG calls it with rows for each edge: A h + b as ``a``, B h as ``b``, W e as ``e``."""
         if self.implementation == "plain":
             return self._odd_plain(a_i, a_j, e, s) if self.is_odd else self._plain(a_i, a_j, e)
         if self.interaction == "negated":
@@ -227,7 +232,7 @@ class MomentumConv(MessagePassing):
         is_joint: bool,
         with_messages: bool,
     ) -> tuple[Tensor, MaybeTensor, MaybeTensor]:
-        """Sum at targets and sources: +m and −m, or for ``directed`` the message of each direction."""
+        """Sum the results of ``message`` at targets and at sources: +m and −m, or for ``directed`` the message of each direction. PyG calls it."""
         forward, reverse = inputs
         x, y, sign = self._outgoing(forward, reverse, with_messages)
         messages = None if not with_messages else torch.cat([x, y]) if self.interaction == "directed" else x

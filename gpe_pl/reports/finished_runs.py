@@ -268,7 +268,8 @@ STAND_IN = "ballistic"
 def rollout_errors(runs: list[Run], split: str, horizon: str, model: str = LEARNED) -> Values:
     """Return rollout MSE [m²] of a model as tables show it: a failed rollout has the error of ballistic flight in the same scene over the same frames.
 
-    The error stays infinite if ballistic flight was not evaluated. ``values_by_seed`` returns the errors without this replacement.
+    The error stays infinite if ballistic flight was not evaluated. ``values_by_seed``, which has the same arguments, returns the errors without this
+    replacement.
     """
     errors = []
     for run in runs:

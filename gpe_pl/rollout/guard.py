@@ -59,7 +59,13 @@ class Guard:
             raise ValueError(f"guard limits must be positive, and bounds (low, high), got {self}")
 
     def check(self, state: State, frame: int, before: State | None = None) -> Termination | None:
-        """Return the first violated limit of a state, or None; ``before`` is the state one frame earlier."""
+        """Return the reason why a rollout has to stop at a state, or None if no limit is violated.
+
+        Args:
+            state: new state.
+            frame: its frame number, for the result.
+            before: the state one frame earlier, to detect paths through obstacles; None skips this.
+        """
         if state.num_nodes == 0:
             return None
         if not self._is_far_from_limits(state):

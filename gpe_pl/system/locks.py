@@ -46,7 +46,7 @@ class FolderError(GpeError):
 
 @dataclass(frozen=True)
 class Holder:
-    """The process that holds a lock: its id, machine, command and start time."""
+    """The process that holds a lock: its id (``pid``), machine (``host``), ``command`` and start time (``since``)."""
 
     pid: int
     host: str

@@ -75,7 +75,14 @@ class BudgetError(GpeError, ValueError):
 
 
 def mean_step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, settings: TrainingSettings) -> float:
-    """Return the mean time per optimiser step [s] over a whole run. The fraction ``push_fraction`` of the steps, at the end, uses push-forward."""
+    """Return the mean time per optimiser step [s] over a whole run, weighted by the fraction of steps with push-forward (``settings.push_fraction``).
+
+    Args:
+        module: module whose steps are measured. The learning rate is 0, so its weights do not change.
+        data: training windows.
+        size: size of the batches.
+        settings: settings of the training.
+    """
     limit = math.inf if settings.budget_minutes is None else FRACTION_TO_MEASURE * 60 * settings.budget_minutes
     if not settings.push_fraction:
         return step_time(module, data, size, settings.gradient_clip, limit=limit)
@@ -95,7 +102,13 @@ def step_time(
     """Return the time per optimiser step [s] in the fastest of several rounds. It includes the building of graphs.
 
     The time is processor time on a CPU and wall time on a GPU. The fastest round is taken because other processes can only slow a step down; even processor
-    time grows when they use the same caches and memory. No further round begins after ``limit`` seconds; the first always runs.
+    time grows when they use the same caches and memory. The first round always runs.
+
+    Args:
+        module, data, size: as in ``mean_step_time``.
+        gradient_clip: largest norm of the gradient; None switches clipping off.
+        push_forward: settings of push-forward in all steps; None for steps without it.
+        limit: time after which no further round begins [s].
     """
     on_gpu = next(module.parameters()).is_cuda
     clock = time.perf_counter if on_gpu else time.process_time

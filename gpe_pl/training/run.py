@@ -117,12 +117,14 @@ class TrainerSettings:
     """Where and how the training runs: one process per device, each with a part of every batch (see ``training.parallel``).
 
     Attributes:
+        accelerator: kind of the devices; ``auto`` takes a GPU if there is one.
         devices: number of devices on each of the ``num_nodes`` machines.
         num_threads: PyTorch's threads in each process; None leaves PyTorch's choice.
         num_workers: number of processes that build graphs; 0 builds them in the training process.
         matmul_precision: PyTorch's precision of matrix products in float32. ``high`` and ``medium`` may use TensorFloat-32 or bfloat16 inside where the
             processor or GPU is faster with them.
         checkpoint_minutes: time between checkpoints, apart from those of validations [min].
+        progress: show a progress bar.
     """
 
     accelerator: Literal["cpu", "gpu", "auto"] = "cpu"
@@ -182,6 +184,15 @@ def train(
 
     With several processes, each of them returns; call ``end_later_processes`` to continue with the first alone. Unless ``torchrun`` or Slurm starts the
     processes, each runs the same command.
+
+    Args:
+        module: module to train.
+        datamodule: training and validation windows.
+        training: settings of the optimisation.
+        trainer_settings: where and how the training runs.
+        loggers: loggers of losses and metrics.
+        run_dir: folder of the run.
+        callbacks: callbacks of Lightning beyond those of every run.
 
     Returns:
         Path of the checkpoint with the best validation rollout.

@@ -28,6 +28,6 @@ def acceleration(vel_next: Array, vel: Array, dt: float) -> Array:
 
 
 def advance(pos: Array, vel: Array, acc: Array, dt: float) -> tuple[Array, Array]:
-    """Return positions in m and velocities in m/s after one symplectic Euler step of ``dt``."""
+    """Return positions in m and velocities in m/s after one symplectic Euler step of ``dt`` [s] under the acceleration ``acc`` [m/s²]."""
     vel = vel + acc * dt
     return pos + vel * dt, vel

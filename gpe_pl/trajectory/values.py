@@ -66,7 +66,7 @@ def size_conflicts(arrays: Mapping[str, np.ndarray], dim: int, num_params: int) 
 def faults(
     arrays: Mapping[str, np.ndarray], names: Sequence[str], materials: Sequence[str], param_names: Sequence[str], first_frame: int = 0
 ) -> Iterator[Fault]:
-    """Yield a fault for every field that breaks its rule, or for every parameter in ``material_params``; fields without frames come first.
+    """Yield a fault for each array that breaks the rule of its field; for ``material_params``, one for each column that does. Fields without frames come first.
 
     Args:
         arrays: arrays by their names in ``schema.FIELDS``, without conflicts of size (``size_conflicts``).

@@ -33,7 +33,8 @@ def rollout_figure(
     """Draw a rollout as a film strip: ground truth in the top row, one row per prediction below, time to the right, materials at the bottom.
 
     Args:
-        ground_truth: trajectory that sets the times, evenly spaced from its first to its last frame; a prediction in its place is labelled so.
+        ground_truth: first trajectory, which sets the times, evenly spaced from its first to its last frame. If it is a prediction, its row is called
+            ``prediction``.
         predictions: rollouts from frame 0 of the ground truth, by the name of their row. A rollout that stopped early shows its reason in
             place of the missing frames.
         num_columns: number of times; fewer if there are fewer frames.

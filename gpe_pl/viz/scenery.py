@@ -51,7 +51,7 @@ class Cover:
 
 
 def draw_scenery(axes: Any, camera: Camera, trajectory: Trajectory, points_per_metre: float) -> Cover:
-    """Draw the boundary of a trajectory; return the cover of its surfaces."""
+    """Draw the boundary of a trajectory into ``axes``; return the ``Cover`` of its surfaces. ``points_per_metre`` is the scale of the picture."""
     if trajectory.metadata.dim == 2:
         _draw_2d(axes, trajectory)
         return Cover(camera, np.empty((0, 2)), trajectory.metadata.spacing)

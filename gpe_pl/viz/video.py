@@ -42,7 +42,7 @@ def write_animation(
 
     Args:
         path: file that ends in ``.gif`` or ``.mp4``.
-        ground_truth: trajectory that sets the length; a prediction in its place is labelled so.
+        ground_truth: first trajectory, which sets the length. If it is a prediction, its panel is called ``prediction``.
         predictions: rollouts from frame 0 of the ground truth, by the name of their panel.
         fps: frames per second of the animation; a GIF rounds the time of a frame to 10 ms.
         stride: step between shown frames of the trajectory.
@@ -62,7 +62,7 @@ def write_animation(
 
 
 def write_film(path: Path | str, name: str, trajectory: Trajectory, fps: int | float = 25, color: ColorBy = "height") -> None:
-    """Write an animation of a single trajectory under a name, larger than in ``write_animation``."""
+    """Write an animation of a single trajectory, larger than in ``write_animation``. ``name`` is the title of its panel; other arguments are as there."""
     _write(Path(path), {name: trajectory.with_moving_boundary()}, range(trajectory.num_frames), fps, color, None, FILM_PIXELS)
 
 

@@ -74,7 +74,7 @@ def write_viewer(
 
     Args:
         path: file that ends in ``.html``.
-        ground_truth: trajectory that sets the length; a prediction in its place is labelled so.
+        ground_truth: first trajectory, which sets the length. If it is a prediction, its panel is called ``prediction``.
         predictions: rollouts of the same frames, by name; the page shows one at a time. Without predictions it shows the ground truth alone.
         stride: step between shown frames.
         title: title of the page; by default data set and split.

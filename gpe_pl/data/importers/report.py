@@ -20,7 +20,7 @@ MAX_LISTED = 20
 
 @dataclass(frozen=True)
 class Event:
-    """A statement about one trajectory; ``frame`` is -1 if it concerns no particular frame."""
+    """A statement about one trajectory of a split: what was repaired, refused or looks wrong. ``frame`` is -1 if it concerns no particular frame."""
 
     split: str
     trajectory: str
@@ -34,7 +34,7 @@ class Event:
 
 @dataclass
 class SplitCounts:
-    """Number of trajectories of a split, and ranges ``[fewest, most]`` of their frames, nodes and boundary nodes."""
+    """Number of ``trajectories`` of a split, and the ranges ``[fewest, most]`` of their ``frames``, ``nodes`` and ``boundary_nodes``."""
 
     trajectories: int = 0
     frames: list[int] = field(default_factory=lambda: [0, 0])

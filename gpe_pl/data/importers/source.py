@@ -166,7 +166,12 @@ def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any
 
 @dataclass(frozen=True)
 class Repair:
-    """A change that was necessary to store a trajectory. ``frame`` is the first changed frame, or -1 if the change does not concern a particular frame."""
+    """A change that was necessary to store a trajectory.
+
+    Attributes:
+        what: the change, in words.
+        frame: first changed frame, or -1 if the change does not concern a particular frame.
+    """
 
     what: str
     frame: int = -1
@@ -193,7 +198,7 @@ class Loaded:
 
 @dataclass(frozen=True)
 class Item:
-    """One trajectory of a source: its name, and the function that reads it. Reading raises ``Refusal`` or ``ArrayError`` if it cannot be used."""
+    """One trajectory of a source: its ``name``, and ``load``, which reads it. ``load`` raises ``Refusal`` or ``ArrayError`` if it cannot be used."""
 
     name: str
     load: Callable[[Facts], Loaded]
@@ -201,7 +206,13 @@ class Item:
 
 @dataclass(frozen=True)
 class Source:
-    """A data set in a public format: its facts, the trajectories of each split, and warnings about the whole data set."""
+    """A data set in a public format.
+
+    Attributes:
+        facts: facts that all trajectories share.
+        splits: trajectories of each split.
+        warnings: what looks wrong about the whole data set.
+    """
 
     facts: Facts
     splits: Mapping[str, Sequence[Item]]

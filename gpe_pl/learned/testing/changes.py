@@ -31,7 +31,10 @@ def to_dtype(data: HeteroData, dtype: torch.dtype) -> HeteroData:
 
 
 def turned(data: HeteroData, spec: FeatureSpec, seed: int = 0, *, turn: bool = True, shuffle: bool = True) -> HeteroData:
-    """Return the graph with half of its reversible edges reversed (``turn``), and with its edges in random order (``shuffle``)."""
+    """Return the graph with a random half of its reversible edges reversed (``turn``), and with its edges in random order (``shuffle``).
+
+    ``spec`` lists the relations of the graph. An edge is reversible if ``schema.is_symmetric`` holds for its relation.
+    """
     out = data.clone()
     random = torch.Generator().manual_seed(seed)
     for relation in spec.relations:

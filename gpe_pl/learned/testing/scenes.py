@@ -43,7 +43,17 @@ def state(
     low: float = 0.02,
     high: float = 0.45,
 ) -> State:
-    """Return a random cloud of the given materials near a corner of the box, in random order."""
+    """Return a random cloud of particles near a corner of a unit box.
+
+    Args:
+        num_nodes: number of particles.
+        materials: materials, which the particles have in turn.
+        history: number of past velocities.
+        seed: seed of the cloud.
+        walls: whether the box has walls.
+        dim: dimension of space.
+        low, high: range of the positions along each axis [m].
+    """
     rng = np.random.default_rng(seed)
     pos = rng.uniform(low, high, (num_nodes, dim))
     past = rng.normal(scale=1.0, size=(num_nodes, history, dim))
@@ -89,7 +99,14 @@ def mesh_state(
 ) -> State:
     """Return a state of strained, moving bodies of ``mesh`` and clouds of all other materials, with nodes in random order.
 
-    The bodies stand side by side, ``gap`` spacings apart.
+    Args:
+        kind: kind of the mesh, see ``mesh``.
+        materials: materials of the scene. Those that can have a mesh are the materials of the bodies, in turn.
+        num_bodies: number of bodies, which stand side by side.
+        gap: distance between bodies [rest spacings].
+        history: number of past velocities.
+        seed: seed of the scene.
+        walls: whether the box has walls.
     """
     dim, rng = 3 if kind == "tetrahedra" else 2, np.random.default_rng(seed)
     meshes = [m for m in materials if m in MESH_MATERIALS]
