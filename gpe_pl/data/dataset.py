@@ -121,7 +121,7 @@ class StoredTrajectory:
         return read_trajectory(self.path, self.name, frames=slice(first, last)).every(self.stride)
 
     def whole(self) -> Trajectory:
-        """Return all stored frames after comparing them with their stored digest. Errors are those of ``window``."""
+        """Return all stored frames. Their digest is verified, either now or when they were cached. Errors are those of ``window``."""
         return read_trajectory(self.path, self.name, verify=True) if self.cached is None else self.cached
 
 

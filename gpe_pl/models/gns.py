@@ -34,7 +34,7 @@ TINY = 1e-12
 
 
 class InteractionNetwork(nn.Module):
-    """Network that computes e' and h' of one processor step."""
+    """Network of one processor step. It computes e' and h' of the module's equations."""
 
     def __init__(self, hidden_channels: int, num_hidden_layers: int) -> None:
         super().__init__()

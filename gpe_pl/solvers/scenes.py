@@ -74,7 +74,7 @@ class Scene(Protocol):
 
 
 def describe(scene: Scene, frame_dt: float, **provenance: Any) -> Metadata:
-    """Return the metadata of a scene's trajectories; ``provenance`` takes the other fields of ``Metadata``."""
+    """Return the metadata of a scene's trajectories. ``provenance`` sets the fields of ``Metadata`` that the scene does not know, and may replace others."""
     return Metadata(
         **{
             "dataset": "-".join(scene.materials),

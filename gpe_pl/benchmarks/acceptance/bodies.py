@@ -75,7 +75,7 @@ def _bodies(trajectory: Trajectory) -> Bodies:
 
 
 def sideways_speed(trajectory: Trajectory) -> float:
-    """Return the largest sideways speed of the centre of mass [m/s], averaged over ``WINDOW`` frames."""
+    """Return the largest of the mean sideways speeds of the centre of mass over ``WINDOW`` frames [m/s]."""
     x = centre(trajectory)[:, 0]
     return float(np.abs(x[WINDOW:] - x[:-WINDOW]).max()) / (WINDOW * trajectory.metadata.frame_dt)
 

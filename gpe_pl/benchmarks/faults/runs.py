@@ -62,7 +62,7 @@ class Command:
     """A command, and the folders of its data and results.
 
     Attributes:
-        name: row of the matrix.
+        name: name in the table of outcomes.
         module: module in ``python -m gpe_pl.{module}``.
         arguments: all arguments but the folders.
         data: folder of the data, or None if the command makes its own data.

@@ -249,7 +249,7 @@ def archive_changes() -> Iterator[tuple[str, Change]]:
 
 
 def converted(raw: Path, change: Change, folder: Path) -> Verdict:
-    """Import a source with one changed archive; it must be refused, or left out by name."""
+    """Import a source with one changed archive. It must be refused, or the report must name the archive as left out."""
     source = folder / "raw"
     shutil.copytree(raw, source)
     change(source / "train" / "00.npz")

@@ -41,7 +41,7 @@ class Fault:
     """A deliberate fault.
 
     Attributes:
-        kind: row of the matrix.
+        kind: kind of the fault, a row in the table of outcomes.
         name: exact description, with which the fault can be repeated.
         attack: function that injects the fault in an empty folder and returns the verdict; can be pickled.
         seconds: duration of the same action without the fault [s].
