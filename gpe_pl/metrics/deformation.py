@@ -1,4 +1,4 @@
-"""Deformation of bodies: what the best rigid motion of the undeformed body leaves of its motion, and the elastic energy in its cells.
+"""Deformation of bodies: the part of a body's motion that its best rigid motion does not explain, and the elastic energy in its cells.
 
 With X the rest positions and x the positions of one body relative to its centre of mass, and m the masses of its nodes::
 
