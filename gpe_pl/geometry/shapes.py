@@ -178,10 +178,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Bowl:
-    """A closed spherical (2D: circular) container. Everything outside of it is solid.
-
-    ``center`` and ``radius`` are in m; ``friction`` and ``restitution`` are as in ``Shape``.
-    """
+    """A closed spherical (2D: circular) container with ``center`` [m] and ``radius`` [m]. Everything outside of it is solid; other fields as in ``Shape``."""
 
     center: tuple[float, ...]
     radius: float
@@ -277,11 +274,7 @@ def _require_simple(vertices: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Polygon:
-    """A solid simple polygon (2D).
-
-    Attributes:
-        vertices: corners in counter-clockwise order [m].
-        friction, restitution: as in ``Shape``.
+    """A solid simple polygon (2D) with ``vertices`` in counter-clockwise order [m]; ``friction`` and ``restitution`` as in ``Shape``.
 
     Raises:
         ValueError: there are fewer than 3 vertices, edges touch or have no length, or the vertices run clockwise.
@@ -377,13 +370,9 @@ class DistanceGrid:
     def from_values(
         cls, origin: Sequence[float] | np.ndarray, spacing: float, values: np.ndarray, friction: float, restitution: float = 0.0
     ) -> DistanceGrid:
-        """Create a grid from signed distances. They are rounded to about 1/4096 of ``spacing``.
+        """Create a grid from signed distances ``values`` [node along x, node along y(, node along z)] in m, rounded to about 1/4096 of ``spacing``.
 
-        Args:
-            origin: position of the first node [m].
-            spacing: distance of neighbouring nodes along each axis [m].
-            values: signed distances [node along x, node along y(, node along z)] in m.
-            friction, restitution: as in ``Shape``.
+        The other arguments are fields of the class.
 
         Raises:
             ValueError: an axis has fewer than 2 nodes, there are too many nodes, values are not finite, or there are not 2 or 3 axes.
