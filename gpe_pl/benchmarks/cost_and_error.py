@@ -95,7 +95,7 @@ def ratio_at_cost(point: Point, solvers: Sequence[Point], horizon: str) -> Inter
     """Return a simulator's mean error over that of the solvers at its cost, with its 95 % interval over paired scenes.
 
     The solvers' error of each scene is interpolated between the two solvers of the Pareto front with the next lower and the next higher cost, with the same
-    weights in all scenes. Return None if every solver costs more.
+    weights in all scenes. If the simulator costs more than all solvers, the most expensive one is taken. Return None if every solver costs more.
     """
     best = front(solvers, horizon)
     if not best or point.cost < best[0].cost:

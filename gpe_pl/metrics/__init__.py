@@ -1,4 +1,4 @@
-"""Errors of rollouts against ground truth (``rollouts``), of bodies that bend among them (``bodies``), and intervals of their statistics."""
+"""Errors of rollouts against ground truth and their confidence intervals (``rollouts``), and metrics of bodies that bend (``bodies``)."""
 
 from gpe_pl.metrics.rollouts import BOTH as BOTH
 from gpe_pl.metrics.rollouts import HORIZONS as HORIZONS

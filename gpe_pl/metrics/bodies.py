@@ -64,7 +64,7 @@ class Bodies:
         return cls(trajectory, nodes) if nodes else None
 
     def predicted(self, prediction: Trajectory) -> Bodies:
-        """Return the same bodies as a rollout moves them. Everything but its positions and stress is taken from this trajectory."""
+        """Return these bodies with positions and stress of a rollout of the same scene. Everything else is taken from this trajectory."""
         return replace(self, trajectory=replace(self.trajectory, pos=prediction.pos, stress=prediction.stress))
 
     @cached_property

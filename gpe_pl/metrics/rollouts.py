@@ -396,7 +396,7 @@ class RolloutMSE(Metric):
         self.add_state("count", torch.zeros(len(self.horizons), dtype=torch.int64), dist_reduce_fx="sum")
 
     def update(self, prediction: Trajectory, ground_truth: Trajectory) -> None:
-        """Add one trajectory."""
+        """Add the errors of one rollout."""
         error = per_frame_mse(prediction, ground_truth)
         for horizon, steps in _reached(self.horizons, error, ground_truth):
             k = self.horizons.index(horizon)

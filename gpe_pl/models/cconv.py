@@ -96,7 +96,13 @@ class ContinuousConvNet(Model):
         return Prediction(self.compute(x, params, edges) if params else {})
 
     def compute(self, x: dict[str, Tensor], params: dict[str, Tensor], edges: Offsets) -> dict[str, Tensor]:
-        """Compute ``forward`` on plain tensors; ``torch.compile`` compiles this part."""
+        """Do the computation of ``forward`` on plain tensors. ``torch.compile`` compiles this method.
+
+        Args:
+            x: features of nodes by node type [node, channel].
+            params: standardised material parameters by material [node, param].
+            edges: edges by relation.
+        """
         particles = {m: x[m] for m in params}
         features, kind = self.particles.nodes(particles, params)
         features = torch.cat([features, functional.one_hot(kind, self.particles.num_kinds).to(features.dtype)], dim=1)

@@ -113,7 +113,13 @@ class DPINet(Model):
         return Prediction(self.compute(x, params, edges) if params else {})
 
     def compute(self, x: dict[str, Tensor], params: dict[str, Tensor], edges: Edges) -> dict[str, Tensor]:
-        """Compute ``forward`` on plain tensors; ``torch.compile`` compiles this part."""
+        """Do the computation of ``forward`` on plain tensors. ``torch.compile`` compiles this method.
+
+        Args:
+            x: features of nodes by node type [node, channel].
+            params: standardised material parameters by material [node, param].
+            edges: edges by relation.
+        """
         features, kind = self.graph.nodes(x, params)
         features = torch.cat([features, functional.one_hot(kind, self.graph.num_kinds).to(features.dtype)], dim=1)
         h = features.new_zeros(features.shape[0], self.hidden_channels)

@@ -96,7 +96,13 @@ class GNS(Model):
         return Prediction(self.compute(x, params, edges) if params else {})
 
     def compute(self, x: dict[str, Tensor], params: dict[str, Tensor], edges: Edges) -> dict[str, Tensor]:
-        """Compute ``forward`` on plain tensors; ``torch.compile`` compiles this part."""
+        """Do the computation of ``forward`` on plain tensors. ``torch.compile`` compiles this method.
+
+        Args:
+            x: features of nodes by node type [node, channel].
+            params: standardised material parameters by material [node, param].
+            edges: edges by relation.
+        """
         features, kind = self.graph.nodes(x, params)
         edge_index, edge_features = self.graph.edges(x, edges, edges, edges)
         length = self._lengths(edges, edge_features)

@@ -488,7 +488,7 @@ class GPE(Model):
         body: dict[str, Tensor],
         edges: Edges,
     ) -> Decoded:
-        """Compute ``forward`` on plain tensors; ``torch.compile`` compiles this part."""
+        """Do the computation of ``forward`` on plain tensors, by node type and relation. ``torch.compile`` compiles this method."""
         if self.interaction == "negated":
             edges = {r: (*orient(index, odd), even) if is_symmetric(r) else (index, odd, even) for r, (index, odd, even) in edges.items()}
         is_inference = not torch.is_grad_enabled()

@@ -54,7 +54,7 @@ def reordered(edges: Edges, order: dict[str, Tensor]) -> Edges:
 
 
 def renumbered(edges: Edges, masks: dict[str, Tensor]) -> Edges:
-    """Return the edges with the numbers that nodes have after only those in ``masks`` are kept. All ends of edges must be kept."""
+    """Return the edges with new node numbers, after only the nodes in ``masks`` are kept. Both ends of every edge must be among them."""
     return _with_numbers(edges, {t: torch.cumsum(mask, dim=0) - 1 for t, mask in masks.items()})
 
 

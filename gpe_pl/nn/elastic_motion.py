@@ -37,7 +37,7 @@ MAX_SUBSTEPS = 96
 STABLE = 0.7
 """Length of a substep as a fraction of the largest one that is proven to be stable at the start of the frame. Cells may stiffen within the frame."""
 LOGARITHM_SCALE = 5.0
-"""Factor by which logarithms of constants follow their weights, so that training finds them within some hundred steps."""
+"""The logarithms of constants are this factor times their weights, so that training finds the constants within some hundred steps."""
 FIRST_GUESS = (10.0, 10.0, 0.1)
 """λ, μ and η before training, in units of density × (spacing/frame)²: waves cross a few cells in a frame."""
 

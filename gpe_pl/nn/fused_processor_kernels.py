@@ -16,7 +16,7 @@ from gpe_pl.nn.matrix_product import gemm
 from gpe_pl.nn.pointers import matrix_at
 
 EDGES = 512
-"""Number of edges whose gradients are kept for a product with their features."""
+"""Number of edges whose gradients are stored at a time, to be multiplied with their features in one product."""
 OPTIONS = {"cache": True, "error_model": "numpy"}
 REASSOCIATED = {*FASTMATH, "reassoc"}
 

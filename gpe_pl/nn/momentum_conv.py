@@ -32,7 +32,7 @@ RAW = 32
 MaybeTensor = Optional[Tensor]  # noqa: UP045 - PyG's code generator reads the signatures below and does not understand unions written with |
 
 Ends = tuple[Tensor, MaybeTensor]
-"""Sums at targets and at sources; if both are nodes of one type, one array for both, and None."""
+"""Sums at targets and sums at sources. If both ends are nodes of one type, the first is the sum at all nodes and the second is None."""
 
 
 def orient(edge_index: Int64[Tensor, "2 edge"], odd: Float[Tensor, "edge odd"]) -> tuple[Tensor, Tensor]:

@@ -41,7 +41,7 @@ class Divided:
     """A scene at a finer spacing.
 
     Attributes:
-        state: its state. The nodes of the original scene come first and have their numbers.
+        state: state of the finer scene. Its first nodes are those of the original scene, with the same numbers.
         origin: weights [node, original node] that interpolate values of the original nodes; the rows sum to 1.
     """
 

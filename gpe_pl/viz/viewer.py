@@ -39,7 +39,7 @@ from gpe_pl.viz.scenery import BACKDROP, surface_points
 PAGE = Path(__file__).parent / "page"
 
 LEVELS = 65535
-"""Number of 16-bit values that stand for a quantity; one more stands for no value."""
+"""Number of 16-bit integers that encode the values of a quantity. One further integer means that there is no value."""
 
 FASTEST = 50.0
 """Largest stored speed or stress, as a multiple of the end of its colour scale, so that an exploded value does not use up all levels."""

@@ -232,7 +232,7 @@ class Result:
     shown: list[Shown]
 
     def figure(self) -> Figure:
-        """Draw the scene."""
+        """Draw the figure of the scene."""
         from gpe_pl.benchmarks.acceptance.figures import scene_figure
 
         return scene_figure(self.shown)

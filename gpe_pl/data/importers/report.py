@@ -105,7 +105,7 @@ class Report:
     refusals: list[Event] = field(default_factory=list)
 
     def write(self, folder: Path) -> None:
-        """Write both files atomically."""
+        """Write the report as JSON and as Markdown into a folder, each file atomically."""
         for name, text in ((REPORT_FILE, json.dumps(asdict(self), indent=1) + "\n"), (PAGE_FILE, self.markdown())):
             replace_text(folder / name, text)
 
