@@ -80,8 +80,8 @@ def check_crowding(points: Points, spacing: float) -> None:
     Pairs are counted before they are listed, because counting needs no memory. If no cell contains enough nodes for a collapse, counting is skipped.
 
     Raises:
-        SimulationError: with reason ``clustering``, if more than ``CROWDING_LIMIT`` times as many pairs lie within the radius as at rest; names the most
-            crowded node.
+        SimulationError: with reason ``clustering``, if more than ``CROWDING_LIMIT`` times as many pairs lie within the radius as at rest. The message names
+            the most crowded node.
     """
     num_nodes, dim = points.pos.shape
     if num_nodes < 2:

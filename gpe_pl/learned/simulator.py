@@ -286,7 +286,8 @@ class LearnedSimulator(nn.Module):
 
         Raises:
             IndexError: there are too few frames before ``frame``, or no such frame.
-            SceneError: the frame interval, spacing, dimension or materials differ from training, or a value is not finite or breaks its rule; names the node.
+            SceneError: the frame interval, spacing, dimension or materials differ from training, or a value is not finite or breaks its rule; the message names
+            the node.
         """
         self.check_scene(trajectory.metadata)
         own, scene = self.builder.metadata, trajectory.metadata

@@ -71,7 +71,7 @@ def report_sweep(folder: Path, runs: list[Run]) -> None:
 
 
 def report(folder: Path) -> None:
-    """Write table and figures of the one run in a folder."""
+    """Write table and figures of the single run in ``folder``, without runs in folders below it."""
     _report(folder, [run for run in finished_runs(folder) if run.folder == folder])
 
 

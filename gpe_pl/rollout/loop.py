@@ -167,7 +167,7 @@ def steps(simulator: Simulator, state: State, num_steps: int) -> Iterator[State]
     """Yield the states after each step of one scene, without a guard.
 
     Raises:
-        SimulationError: a step failed; names the frame.
+        SimulationError: a step failed; the message names the frame.
     """
     for _, _, item in step_scenes(simulator, {0: state}, {0: num_steps}):
         if isinstance(item, Termination):

@@ -269,7 +269,7 @@ class TrainingModule(L.LightningModule):
         """Count and report a skipped batch. All ranks do so together, as ``value`` is a sum over ranks.
 
         Raises:
-            TrainingError: too many of the last batches were skipped; names step, trajectories and frames.
+            TrainingError: too many of the last batches were skipped; the message names step, trajectories and frames.
         """
         windows = [window for part in ranks.gathered(self._windows) for window in part]
         what = f"step {self.global_step}: the {name} is {value} for (trajectory, frame) = {', '.join(map(str, windows))}"

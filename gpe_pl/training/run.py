@@ -198,8 +198,8 @@ def train(
         Path of the checkpoint with the best validation rollout.
 
     Raises:
-        RunError: the accelerator or devices are not available, or training was interrupted; says how to resume.
-        TrainingError: losses are not finite; names the last checkpoint.
+        RunError: the accelerator or devices are not available, or training was interrupted; the message says how to resume.
+        TrainingError: losses are not finite; the message names the last checkpoint.
         CheckpointError: training cannot resume from ``last.ckpt``.
     """
     datamodule.push_forward = training.push_forward  # known only now, as it depends on the number of steps within a time budget

@@ -71,7 +71,7 @@ STATES: dict[str, Callable[[str], dict[str, Any]]] = {
 
 
 def resumed(command: Command, state: str, path: str, limit: float, folder: Path) -> Verdict:
-    """Interrupt a training, write a path outside its folder into all callback states of its checkpoint, and repeat the command."""
+    """Interrupt a training, put a path that leads outside into the states of callbacks in its checkpoint (see ``STATES``), and repeat the command."""
     own = folder / "own"
     own.mkdir()
     last = interrupted(command, limit, own)

@@ -224,7 +224,7 @@ class Features(Mapping[str, Feature]):
 
 
 class Frames:
-    """A feature per frame. It is decoded when it is looked up; that raises ``Refusal`` if its data are damaged."""
+    """Sequence of one feature per frame. A feature is decoded when it is looked up; that raises ``Refusal`` if its data are damaged."""
 
     def __init__(self, entries: _Message) -> None:
         self._data, self._rows = entries.data, entries.fields(1)
