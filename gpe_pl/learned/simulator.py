@@ -70,8 +70,10 @@ class LearnedSimulator(nn.Module):
         clamps_parameters: clamp material parameters outside the range of training to the nearest trained value. A network is less reliable outside this range.
         static_friction: fraction of the speed that gravity gives in one frame. Nodes on a wall that are slower keep their positions (see
             ``nn.static_friction``). 0 switches this off.
+        acceleration_std, stress_std: units of the model's accelerations [m/s²] and stresses [Pa].
+        trained_scene, trained_mass: ranges in training, as in ``scene_ranges`` and ``training_ranges.outside_masses``.
 
-    You may change these attributes at any time. Of these three, ``save`` stores only ``static_friction``.
+    You may change the first three attributes at any time. Of them, ``save`` stores only ``static_friction``.
     """
 
     model: Model
