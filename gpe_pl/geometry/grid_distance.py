@@ -49,7 +49,7 @@ def columns_of(low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.n
 
 
 def below_heights(heights: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Return signed distances [m] to the ground, whose heights [m] are given at the grid's vertical lines."""
+    """Return signed distances [m] to the ground, given its heights [along x, along y] in m at the grid's vertical lines."""
     corners = _ground(heights, low, spacing, np.ones((counts[0] - 1, counts[1] - 1), dtype=bool))
     z = low[2] + spacing * np.arange(counts[2])
     return np.where(z < heights[..., None], -1.0, 1.0) * unsigned(corners, low, spacing, counts)
@@ -92,7 +92,9 @@ def mesh_distances(corners: np.ndarray, low: np.ndarray, spacing: float, counts:
 
 
 def cloud_distances(points: np.ndarray, normals: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Return signed distances [m] to an oriented point cloud: weighted means of the distances to the tangent planes of the nearest points.
+    """Return signed distances [m] to a point cloud [point, 3] with unit ``normals`` [point, 3] into free space.
+
+    They are weighted means of the distances to the tangent planes of the nearest points.
 
     Tangent planes are good approximations only near the cloud. Far from it, the result is the distance to the nearest point with the sign of the weighted mean.
     """

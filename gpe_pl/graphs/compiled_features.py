@@ -1,7 +1,8 @@
 """The features of ``features``, compiled for the CPU: one pass over nodes or edges that also standardises.
 
 Values are computed in double precision, rounded to the precision of the output, and then standardised in it: (value − mean) · (1 / std). Raw features have the
-mean 0 and 1 / std = 1.
+mean 0 and 1 / std = 1. In all functions, ``mean`` and ``inverse`` are the mean and 1 / std of the channels of ``out``, and ``velocity_unit`` and
+``acceleration_unit`` are those of ``features.Scales``.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ ROUNDED_TO_ZERO = 1e-9
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def motion(history, rows, gravity, level, velocity_unit, acceleration_unit, mean, inverse, out):
-    """Write ``features.material_features`` of nodes to ``out`` [row, channel], or ``features.virtual_features`` if ``level`` [row] is not empty."""
+    """Write ``features.material_features`` of nodes to ``out`` [row, channel], or ``features.virtual_features`` if ``level`` [row] is not empty.
+
+    ``history`` has the velocities of nodes [node, history, dim] in m/s, and ``rows`` the nodes of each row of ``out``.
+    """
     num_steps, dim = history.shape[1], history.shape[2]
     per_velocity = 1 / velocity_unit
     for k in range(rows.shape[0]):
@@ -39,7 +43,11 @@ def motion(history, rows, gravity, level, velocity_unit, acceleration_unit, mean
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def walls(vel, normal, friction, restitution, rows, with_condition, velocity_unit, mean, inverse, out):
-    """Write ``features.boundary_features`` of boundary nodes to ``out`` [row, channel]."""
+    """Write ``features.boundary_features`` of boundary nodes to ``out`` [row, channel].
+
+    The first four arguments are arrays of a ``Boundary``, and ``rows`` has the boundary node of each row of ``out``. ``with_condition`` is
+    ``GraphConfig.boundary_condition``.
+    """
     dim = vel.shape[1]
     for k in range(rows.shape[0]):
         n = rows[k]
@@ -117,6 +125,7 @@ def points_of_mesh(pos, rest_pos, history, mass, shift, descent, num_virtual):
     """Return positions, rest positions and velocities of mesh nodes and of the virtual nodes above them [point, 3 dim], and the histories of the virtual nodes.
 
     A history has the last velocities [virtual, history, dim]. The values of a virtual node are the means over the mesh nodes below it, weighted by mass.
+    ``shift`` and ``descent`` are as in ``MeshTopology``; an empty ``shift`` stands for zero.
     """
     num_nodes, dim = pos.shape
     num_steps = history.shape[1]
