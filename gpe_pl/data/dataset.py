@@ -257,7 +257,7 @@ def _read_only(trajectory: Trajectory) -> Trajectory:
 
 
 @dataclass(frozen=True)
-class Start:
+class UnrollStart:
     """The start of an unroll with the ground truth that follows.
 
     Attributes:
@@ -287,7 +287,7 @@ class Start:
         """Number of steps of the unroll."""
         return self.truth.shape[0] - 2
 
-    def to(self, device: Any) -> Start:
+    def to(self, device: Any) -> UnrollStart:
         """Return the same start on another device."""
         stress = None if self.stress is None else self.stress.to(device)
         return replace(self, state=self.state.to_torch(device), truth=self.truth.to(device), stress=stress)
@@ -321,8 +321,8 @@ class Unroll:
         state: initial state with noise, as float64 tensors.
         reference: positions [num_steps, node, dim] in m that the state should have after each step: the true ones, plus the part of the noise on the last
             position that the targets have not removed (see ``Noise.correction``).
-        stress: true Cauchy stress [num_steps, node, component] in Pa after each step; None as in ``Start``.
-        about: attributes of the graphs, as in ``Start``.
+        stress: true Cauchy stress [num_steps, node, component] in Pa after each step; None as in ``UnrollStart``.
+        about: attributes of the graphs, as in ``UnrollStart``.
     """
 
     graph: HeteroData
@@ -376,13 +376,13 @@ def training_graph(builder: GraphBuilder, state: State, target: Tensor, stress: 
     return data
 
 
-Samples: TypeAlias = HeteroData | list[Start] | list[Unroll]
+Samples: TypeAlias = HeteroData | list[UnrollStart] | list[Unroll]
 """Samples of an optimiser step: one batch of graphs, the starts of unrolls of push-forward, or unrolls with gradients."""
 
 
-def collated(samples: list[HeteroData | Start | Unroll]) -> Samples:
+def collated(samples: list[HeteroData | UnrollStart | Unroll]) -> Samples:
     """Join samples of one kind: graphs become one batch, starts and unrolls a list."""
-    starts = [sample for sample in samples if isinstance(sample, Start)]
+    starts = [sample for sample in samples if isinstance(sample, UnrollStart)]
     unrolls = [sample for sample in samples if isinstance(sample, Unroll)]
     return starts or unrolls or batched(samples)
 
@@ -407,7 +407,7 @@ def window_counts(trajectories: Sequence[StoredTrajectory], history: int, steps:
     return counts
 
 
-class WindowDataset(Dataset[HeteroData | Start | Unroll]):
+class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
     """Windows x[t−H … t+1] of a split as graphs at frame t.
 
     Every material's store has ``target`` [node, dim] in m/s²: the acceleration from t to t+1 without gravity, from float64 differences. For error
@@ -485,12 +485,12 @@ class WindowDataset(Dataset[HeteroData | Start | Unroll]):
     def __getitem__(self, key: int | tuple[int, int]) -> HeteroData: ...
 
     @overload
-    def __getitem__(self, key: StartKey) -> Start: ...
+    def __getitem__(self, key: StartKey) -> UnrollStart: ...
 
     @overload
     def __getitem__(self, key: UnrollKey) -> Unroll: ...
 
-    def __getitem__(self, key: Key) -> HeteroData | Start | Unroll:
+    def __getitem__(self, key: Key) -> HeteroData | UnrollStart | Unroll:
         """Return the graph of a window, the start of an unroll for a ``StartKey``, or an unroll for an ``UnrollKey``.
 
         The trajectory's length limits the unroll of a ``StartKey``.
@@ -544,7 +544,9 @@ class WindowDataset(Dataset[HeteroData | Start | Unroll]):
         if start is not None or targets is not None:
             correction = 0.0 if self.noise is None else self.noise.correction
             key = start or StartKey(sample, window, 0)
-            unroll = Start(state, torch.from_numpy(truth[history:]), stress, correction, key.correction, about, sample, key.lane, targets)
+            unroll = UnrollStart(
+                state, torch.from_numpy(truth[history:]), stress, correction, key.correction, about, sample, key.lane, targets
+            )
             return unroll if start else unroll.graph(self.builder, state, 0)
         target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
         graph = training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[0], about)

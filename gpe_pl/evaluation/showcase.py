@@ -60,7 +60,7 @@ class ShowcaseSettings:
 
 
 @dataclass(frozen=True)
-class Record:
+class Measurement:
     """A measured quantity: name of the ``metric``, ``value`` and ``unit``."""
 
     metric: str
@@ -103,7 +103,7 @@ def run(
     settings: ShowcaseSettings,
     folder: Path,
     on_progress: Callable[[int, int], Any] | None = None,
-) -> list[Record]:
+) -> list[Measurement]:
     """Roll the simulator out from a ``start``; writes ``showcase.json``, ``.md``, ``.png`` and ``.gif`` (``.mp4`` if ``imageio_ffmpeg`` is installed).
 
     Args:
@@ -143,8 +143,8 @@ def run(
     if runner is not simulator:
         records += tally.skipped()
     if outside:
-        records.append(Record("num_uncontained_steps", float(len(outside)), "1"))
-        records.append(Record("fraction_outside_uncontained", float(np.mean(outside)), "1"))
+        records.append(Measurement("num_uncontained_steps", float(len(outside)), "1"))
+        records.append(Measurement("fraction_outside_uncontained", float(np.mean(outside)), "1"))
     finite = [vars(r) | {"value": r.value if math.isfinite(r.value) else None} for r in records]  # nan after no step; JSON has none
     written = {"environment": environment(), "records": finite, "stopped": stop}
     replace_text(folder / "showcase.json", json.dumps(written, indent=1, allow_nan=False))
@@ -177,11 +177,14 @@ class _Tally:
         self.lost_impulse += state.lost_impulse
         self.num_too_fast += int((speed > self.limit).sum())
 
-    def skipped(self) -> list[Record]:
+    def skipped(self) -> list[Measurement]:
         particle_steps = len(self.seconds) * self.end.num_nodes or math.nan
-        return [Record("fraction_asleep", self.num_asleep / particle_steps, "1"), Record("lost_impulse", self.lost_impulse, "kg m/s")]
+        return [
+            Measurement("fraction_asleep", self.num_asleep / particle_steps, "1"),
+            Measurement("lost_impulse", self.lost_impulse, "kg m/s"),
+        ]
 
-    def records(self) -> list[Record]:
+    def records(self) -> list[Measurement]:
         num_steps, size = len(self.seconds), self.end.num_nodes
         particle_steps = num_steps * size if num_steps else math.nan
         found: dict[str, tuple[float, str]] = {
@@ -195,7 +198,7 @@ class _Tally:
             "fraction_outside_at_end": (_fraction_deeper(self.end, surface_tolerance(self.end.boundary.shapes)), "1"),
             "max_speed": (self.top_speed, "m/s"),
         }
-        return [Record(metric, float(value), unit) for metric, (value, unit) in found.items()]
+        return [Measurement(metric, float(value), unit) for metric, (value, unit) in found.items()]
 
 
 def _frames(simulator: Simulator, state: State, num_steps: int, metadata: Metadata) -> Any:
@@ -252,12 +255,12 @@ class _Film:
         write_film(stem.with_suffix(extension), "prediction", trajectory, fps=min(25.0, 1 / self.metadata.frame_dt))
 
 
-def table(records: list[Record], stopped: str | None) -> str:
+def table(records: list[Measurement], stopped: str | None) -> str:
     """Return a table in Markdown with one row per record, and the reason if the rollout stopped early."""
     lines = ["| | value | unit |", "|---|---|---|", *(f"| {r.metric.replace('_', ' ')} | {r.value:.6g} | {r.unit} |" for r in records)]
     return "\n".join([*lines, *(["", f"Stopped: {stopped}"] if stopped else []), ""])
 
 
-def summary(records: list[Record]) -> str:
+def summary(records: list[Measurement]) -> str:
     """Return plain text with one line per record."""
     return "\n".join(f"showcase  {r.metric:28} {r.value:12.6g} {r.unit}" for r in records)

@@ -467,10 +467,7 @@ class LearnedSimulator(nn.Module):
         return self.static_friction * self.builder.metadata.frame_dt * gravity.norm()
 
     def supported(self, graph: HeteroData) -> Tensor:
-        """Return a mask [island] of the islands that static friction may keep in place: those that touch walls, none of which moves.
-
-        The features of ``graph`` must not be standardised.
-        """
+        """Return a mask [island] of the islands that static friction may keep in place, from a graph whose features are not standardised."""
         spec = self.builder.spec
         moves = (graph[BOUNDARY].x[:, : spec.dim] != 0).any(dim=1)
         walls = [relation for relation in spec.relations if relation[0] == BOUNDARY]

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 from torch_geometric.data import HeteroData
 
-from gpe_pl.data.dataset import Samples, Start, Unroll
+from gpe_pl.data.dataset import Samples, Unroll, UnrollStart
 from gpe_pl.errors import GpeError
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE
@@ -177,7 +177,7 @@ class TrainingModule(L.LightningModule):
         if isinstance(samples, list) and isinstance(samples[0], Unroll):
             unrolls = [sample for sample in samples if isinstance(sample, Unroll)]
             return self._mean_loss(predictions(self.simulator, unrolls), unrolls[0].num_steps)
-        starts = [sample for sample in samples if isinstance(sample, Start)] if isinstance(samples, list) else []
+        starts = [sample for sample in samples if isinstance(sample, UnrollStart)] if isinstance(samples, list) else []
         batch = self._excursions.graphs(self.simulator, starts) if isinstance(samples, list) else samples
         predicted = self.simulator(batch)
         if starts:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
-from gpe_pl.data.dataset import Start
+from gpe_pl.data.dataset import UnrollStart
 from gpe_pl.graphs.batching import batched
 from gpe_pl.learned.approximate import Batched
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
@@ -79,7 +79,7 @@ class Excursions:
         self.clear()
         self._loaded = {lane: dict(scenes) for lane, scenes in stored.items()}
 
-    def graphs(self, simulator: LearnedSimulator, starts: Sequence[Start]) -> HeteroData:
+    def graphs(self, simulator: LearnedSimulator, starts: Sequence[UnrollStart]) -> HeteroData:
         """Return a batch of graphs of the states that the unrolls have reached.
 
         Scenes whose unroll failed or passed the last ground-truth frame restart.
@@ -101,7 +101,7 @@ class Excursions:
         self._lanes[lane] = under_way
         return batched(under_way.graphs)
 
-    def _taken_up(self, lane: int, starts: Sequence[Start]) -> Excursion | None:
+    def _taken_up(self, lane: int, starts: Sequence[UnrollStart]) -> Excursion | None:
         """Return a batch of these samples as a checkpoint stored it; None if the checkpoint does not have all of them."""
         stored = self._loaded.pop(lane, {})
         if not all(start.sample in stored for start in starts):
@@ -125,7 +125,7 @@ class Excursions:
         under_way.graphs = []
 
 
-def _graph(simulator: LearnedSimulator, start: Start, state: State, step: int) -> HeteroData | None:
+def _graph(simulator: LearnedSimulator, start: UnrollStart, state: State, step: int) -> HeteroData | None:
     if step > start.num_steps:
         return None
     try:
@@ -166,7 +166,7 @@ class _Trainable(Batched):
 
 
 @torch.no_grad()
-def unrolled(simulator: LearnedSimulator, starts: Sequence[Start]) -> tuple[list[State], list[int]]:
+def unrolled(simulator: LearnedSimulator, starts: Sequence[UnrollStart]) -> tuple[list[State], list[int]]:
     """Return states after unrolling each start for ``num_steps`` steps, all starts together, and the number of steps of each.
 
     An unroll ends earlier if no graph of its scene can be built any more.

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gpe_pl.config.datasets import dataset
-from gpe_pl.data.dataset import Start, StartKey, StoredTrajectory, WindowDataset
+from gpe_pl.data.dataset import StartKey, StoredTrajectory, UnrollStart, WindowDataset
 from gpe_pl.data.ground_truth import generate_trajectory
 from gpe_pl.data.noise import Noise
 from gpe_pl.graphs.builder import GraphBuilder
@@ -43,7 +43,7 @@ def windows(solver: Restartable | None, truth: Trajectory, noise: Noise | None =
     return WindowDataset([stored], builder, noise, 0.05, seed=3, stress=truth.stress is not None, solver=solver, mirror=mirror)
 
 
-def start_of(solver: Restartable | None, truth: Trajectory, num_steps: int = 3) -> tuple[WindowDataset, Start]:
+def start_of(solver: Restartable | None, truth: Trajectory, num_steps: int = 3) -> tuple[WindowDataset, UnrollStart]:
     data = windows(solver, truth)
     return data, data[StartKey(0, 4, num_steps)]
 

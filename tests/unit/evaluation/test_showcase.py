@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gpe_pl.evaluation import showcase
-from gpe_pl.evaluation.showcase import Record, ShowcaseSettings, start
+from gpe_pl.evaluation.showcase import Measurement, ShowcaseSettings, start
 from gpe_pl.learned.simulator import LearnedSimulator, SceneError
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.skips import Skips
@@ -36,11 +36,11 @@ def run(
     settings: ShowcaseSettings,
     folder: Path,
     on_progress: Callable[[int, int], None] | None = None,
-) -> list[Record]:
+) -> list[Measurement]:
     return showcase.run(simulated, *start(simulated, scene, settings), settings, folder, on_progress)
 
 
-def values(records: list[Record]) -> dict[str, float]:
+def values(records: list[Measurement]) -> dict[str, float]:
     return {r.metric: r.value for r in records}
 
 

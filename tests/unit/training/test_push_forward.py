@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch_geometric.data import HeteroData
 
-from gpe_pl.data.dataset import Start, StartKey, WindowDataset, open_split
+from gpe_pl.data.dataset import StartKey, UnrollStart, WindowDataset, open_split
 from gpe_pl.data.sampling import PushForward
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
@@ -68,7 +68,7 @@ def test_a_scene_that_falls_apart_on_the_way_ends_where_it_was_whole(
     torch.testing.assert_close(state.pos, simulator.step(first.state).pos, rtol=0, atol=1e-6)
 
 
-def visits(data: WindowDataset, samples: list[tuple[int, int]], lane: int, num_visits: int) -> list[list[Start]]:
+def visits(data: WindowDataset, samples: list[tuple[int, int]], lane: int, num_visits: int) -> list[list[UnrollStart]]:
     return [[data[StartKey(sample, window, step, lane)] for sample, window in samples] for step in range(num_visits)]
 
 
@@ -100,14 +100,14 @@ def test_at_the_end_of_the_truth_and_after_falling_apart_a_sample_is_at_its_star
 
     module._excursions.clear()
     module.loss(turns[0])
-    built = Start.graph
+    built = UnrollStart.graph
 
-    def fails_under_way(self: Start, builder: GraphBuilder, state: State, step: int) -> HeteroData:
+    def fails_under_way(self: UnrollStart, builder: GraphBuilder, state: State, step: int) -> HeteroData:
         if step:
             raise SimulationError("no")
         return built(self, builder, state, step)
 
-    monkeypatch.setattr(Start, "graph", fails_under_way)
+    monkeypatch.setattr(UnrollStart, "graph", fails_under_way)
     assert_equal_graphs(module._excursions.graphs(simulator, turns[1]), usual)
 
 
@@ -175,13 +175,13 @@ def test_walls_that_move_go_on_moving_on_the_way(
         LearnedSimulator(GPE(data.builder.spec, num_message_passing_steps=1, hidden_channels=8), data.builder), num_steps=10
     )
     seen: list[torch.Tensor] = []
-    plain = Start.graph
+    plain = UnrollStart.graph
 
-    def graph(self: Start, builder: GraphBuilder, state: State, step: int) -> HeteroData:
+    def graph(self: UnrollStart, builder: GraphBuilder, state: State, step: int) -> HeteroData:
         seen.append(state.boundary.pos)
         return plain(self, builder, state, step)
 
-    monkeypatch.setattr(Start, "graph", graph)
+    monkeypatch.setattr(UnrollStart, "graph", graph)
     for starts in visits(data, [(0, 0)], 0, 3):
         module.loss(starts)
     first = data.locate(0)[1]
