@@ -276,7 +276,7 @@ class LearnedSimulator(nn.Module):
         yield from outside_masses(state, self.builder.spec.materials, self.trained_mass)
 
     def forward(self, data: HeteroData) -> Prediction:
-        """Return accelerations without gravity per material, in units of ``acceleration_std``."""
+        """Return the model's prediction for a graph whose features are not standardised."""
         limits = dict(self.trained_ranges()) if self.clamps_parameters else None
         return self.model(self.standardizer(data, self.skips.absent_types, limits))
 

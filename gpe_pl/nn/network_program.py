@@ -139,7 +139,7 @@ class NetworkProgram:
         )
 
     def residual(self, h: int, y: int, bias: Tensor) -> None:
-        """Add y plus a bias to h."""
+        """Add matrix y plus a bias to matrix h."""
         self._add(kernels.RESIDUAL, y, h, self.weight(bias), len(bias))
 
     def zero(self, y: int) -> None:

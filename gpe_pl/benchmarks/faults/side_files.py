@@ -107,7 +107,12 @@ def _fifo(path: Path) -> None:
 
 
 def changes(is_table: bool, seed: int = 0) -> Iterator[tuple[str, Change]]:
-    """Yield name and function of every change of a small file; for JSON tables, also values of other types."""
+    """Yield name and function of every change of a small file.
+
+    Args:
+        is_table: whether the file is a JSON table; then further changes replace a value by one of another type.
+        seed: seed for the choice of the changed number or value.
+    """
     for name in _TEXTS:
         yield name, partial(_text, name)
     yield "truncated", _truncated
