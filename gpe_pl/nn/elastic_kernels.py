@@ -206,7 +206,9 @@ def move_forward(
     """
     dim = pos.shape[1]
     force = np.empty_like(pos)
-    path[0], speed_path[0] = pos, vel
+    for n in range(pos.shape[0]):
+        for i in range(dim):
+            path[0, n, i], speed_path[0, n, i] = pos[n, i], vel[n, i]
     for s in range(number.shape[0]):
         h = 1.0 / number[s]
         for k in range(number[s] + 1):

@@ -81,7 +81,9 @@ def _backward(a, b, e, w, slope, source, target, grad_target, grad_source, grad_
             total_w += block_w
             block_below[:] = 0
             block_w[:] = 0
-    grad_w[:] = total_w
+    for q in range(channels):
+        for c in range(width):
+            grad_w[q, c] = total_w[q, c]
     grad_slope[0] = below.sum()
 
 

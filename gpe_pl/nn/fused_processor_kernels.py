@@ -40,6 +40,15 @@ def _matrix(values, offset, rows, columns):
 
 @njit(fastmath=FASTMATH, **OPTIONS)
 @no_type_check
+def _repeat(row, rows):
+    """Write a row [1, width] to all rows. Numba compiles the assignment of an array to an array much longer."""
+    for k in range(len(rows)):
+        for c in range(rows.shape[1]):
+            rows[k, c] = row[0, c]
+
+
+@njit(fastmath=FASTMATH, **OPTIONS)
+@no_type_check
 def _sum_rows(x, total, result):
     total[:] = 0
     for k in range(len(x)):
@@ -204,7 +213,7 @@ def forward(address, convs, updates, incoming, starts, sizes, states, source, ta
             p = convs[o]
             stride, num_target, num_source = 2 * width + p[C_FEATURES], sizes[p[C_TARGET]], sizes[p[C_SOURCE]]
             a, b = _matrix(work, p[C_A], num_target, width), _matrix(work, p[C_B], num_source, width)
-            a[:] = matrix_at(p[C_BIAS], 1, width, work)
+            _repeat(matrix_at(p[C_BIAS], 1, width, work), a)
             h_target, h_source = place + size * states[s, p[C_TARGET]], place + size * states[s, p[C_SOURCE]]
             gemm(work, address, 0, 1, num_target, width, width, h_target, width, p[C_WEIGHT], stride, 1, place + size * p[C_A], width)
             gemm(
@@ -236,7 +245,7 @@ def forward(address, convs, updates, incoming, starts, sizes, states, source, ta
             p = updates[o]
             n = sizes[p[U_TYPE]]
             z, weight = _matrix(work, p[U_Z], n, width), matrix_at(p[U_WEIGHT], width, width, work)
-            z[:] = matrix_at(p[U_BIAS], 1, width, work)
+            _repeat(matrix_at(p[U_BIAS], 1, width, work), z)
             for r in range(p[U_FIRST], p[U_FIRST] + p[U_COUNT]):
                 q = incoming[r]
                 conv, degree = convs[q[I_CONV]], work[q[I_DEGREE] : q[I_DEGREE] + n]
@@ -297,7 +306,9 @@ def backward(
                     grads[p[U_G_GAIN] + c] = total[c]
                     grads[p[U_G_SHIFT] + c] = other[c]
             else:
-                y[:] = grad
+                for k in range(n):
+                    for c in range(width):
+                        y[k, c] = grad[k, c]
             gemm(work, address, 0, 0, n, width, width, free, width, p[U_OUT], width, 0, free + size * largest, width)
             below[:] = 0
             _activate_back(_matrix(work, p[U_Z], n, width), matrix_at(p[U_SLOPE], 1, 1, work)[0, 0], g, active, below)

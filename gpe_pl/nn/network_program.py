@@ -262,7 +262,8 @@ def _run(
     number, connected = np.empty(num_nodes.sum(), np.int64), np.empty(len(num_nodes), np.int64)
     number_nodes(edge_kinds, edges, first_node, num_nodes, number, connected, apart, sorts)
     span = np.zeros((num_sets, 2), np.int64)
-    span[:, 1] = size
+    for k in range(num_sets):
+        span[k, 1] = size[k]
     for t in range(len(num_nodes)):
         span[sets[t, 1], 1] = connected[t]
         span[sets[t, 2], 0], span[sets[t, 2], 1] = connected[t], num_nodes[t]

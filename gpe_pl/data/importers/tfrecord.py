@@ -335,7 +335,9 @@ def _joined(data, rows):
     joined, end = np.empty(rows[:, 2].sum(), np.uint8), 0
     for k in range(len(rows)):
         start, size = rows[k, 1], rows[k, 2]
-        joined[end : end + size] = data[start : start + size]
+        field, own = data[start : start + size], joined[end : end + size]
+        for n in range(size):
+            own[n] = field[n]
         end += size
     return joined
 
