@@ -5,9 +5,10 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import is_dataclass
+from functools import cache
 from typing import Any, get_type_hints
 
-from pydantic import ConfigDict, create_model
+from pydantic import BaseModel, ConfigDict, create_model
 
 MOST_VALUES, MOST_LEVELS, LONGEST_TEXT, LARGEST_NUMBER = 20_000, 20, 10_000, 2**64
 """Limits for plain values from a file. The largest description of a model has some hundreds of values."""
@@ -64,6 +65,12 @@ def checked(target: Callable[..., Any], values: Mapping[str, Any], *later: str) 
     Raises:
         pydantic.ValidationError: a name is unknown or missing, a type is wrong, or a value is out of range or not finite.
     """
-    config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, protected_namespaces=(), allow_inf_nan=False)
-    found = create_model("Settings", __config__=config, **parameters(target, *later))(**values)
+    found = _model(target, *later)(**values)
     return {name: getattr(found, name) for name in found.model_fields_set}
+
+
+@cache
+def _model(target: Callable[..., Any], *later: str) -> type[BaseModel]:
+    """Return the model of the values of a target; Pydantic takes milliseconds to make one."""
+    config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, protected_namespaces=(), allow_inf_nan=False)
+    return create_model("Settings", __config__=config, **parameters(target, *later))
