@@ -74,7 +74,7 @@ def test_data_can_be_read_and_made_without_torch() -> None:
 HEAVY = {"torch", "torch_geometric", "lightning", "torchmetrics", "numba", "scipy", "h5py", "matplotlib", "pandas", "rich", "wandb"}
 
 
-@pytest.mark.parametrize("command", ["fit", "evaluate"])
+@pytest.mark.parametrize("command", ["fit", pytest.param("evaluate", marks=pytest.mark.slow)])
 def test_help_of_a_command_loads_nothing_heavy(command: str) -> None:
     """So that it takes what Hydra takes to compose a configuration, about a second, and no more."""
     child = subprocess.run(

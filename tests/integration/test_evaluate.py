@@ -35,6 +35,13 @@ def evaluate(data: Path, runs: Path, checkpoint: Path | str, *overrides: str) ->
     return list(read_rows(runs / "evaluation_test_unseen" / "metrics.csv"))
 
 
+def untrained(stride: int = 1) -> LearnedSimulator:
+    """Return a small model of the tiny data."""
+    metadata = trajectory_metadata(dataset_spec(compose("simulate", *DATA)), "train", 0).every(stride)
+    builder = GraphBuilder(GraphConfig(history=2), metadata)
+    return LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder, stride)
+
+
 def key(row: Row) -> tuple[str, int, str, str]:
     return row.model, row.trajectory, row.metric, row.horizon
 
@@ -101,11 +108,10 @@ def test_data_that_do_not_fit_are_refused_before_any_is_generated(checkpoint: Pa
     assert not (tmp_path / "data").exists() and not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 def test_a_model_of_longer_frames_asks_for_its_stride(tmp_path: Path) -> None:
-    metadata = trajectory_metadata(dataset_spec(compose("simulate", *DATA)), "train", 0).every(2)
-    builder = GraphBuilder(GraphConfig(history=2), metadata)
     path = tmp_path / "every_second.ckpt"
-    LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder, 2).save(path)
+    untrained(stride=2).save(path)
     for stride in (1, 4):
         with pytest.raises(SceneError, match=r"frame_dt=0.01 s \(data.stride=2\) .* choose the data set with data.stride=2$"):
             evaluate(tmp_path / "data", tmp_path, path, f"data.stride={stride}")
@@ -132,10 +138,8 @@ def test_an_evaluation_that_fails_leaves_no_folder(tiny_data: Path, tmp_path: Pa
 def test_a_shipped_model_is_named(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    fit(tiny(tiny_data, tmp_path))
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "shipped")
-    LearnedSimulator.from_checkpoint(tmp_path / "fit" / "checkpoints" / "best.ckpt").save(tmp_path / "shipped" / "sand.ckpt")
-    capsys.readouterr()
+    untrained().save(tmp_path / "shipped" / "sand.ckpt")
     rows = evaluate(tiny_data, tmp_path, "sand", "evaluation.num_pictures=0")
     assert capsys.readouterr().out.startswith("acceptance not measured\n")
     assert {r.model for r in rows} == {"learned", "ballistic", "stops_at_walls", "constant_velocity"}

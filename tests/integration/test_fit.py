@@ -127,6 +127,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     assert (tmp_path / "whole" / "metrics.csv").read_bytes() == (tmp_path / "parts" / "metrics.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_the_papers_recipe_trains_without_average_and_clipping(
     tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -67,6 +67,7 @@ def config(command: str, tmp_path: Path, *overrides: str) -> DictConfig:
     )
 
 
+@pytest.mark.slow
 def test_a_run_knows_its_data_by_what_they_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     imported(tmp_path / "data", 9.81)
     run = config("fit", tmp_path, "evaluation.splits=[test]", "name=run")

@@ -97,6 +97,7 @@ def test_dam_break(physics):
 BOWL = Bowl((0.5, 0.5, 0.5), 0.45, 0.0)
 
 
+@pytest.mark.slow
 def test_volume_over_a_fall_into_a_bowl(physics):
     """5,400 particles in 3D: the liquid takes the same room while it falls, splashes, sloshes and rests."""
     solver = FLIP(bounds=unit(3), grid_spacing=1 / 32, frame_dt=0.01)
@@ -154,13 +155,10 @@ def caps(radius, spacing, count):
         yield points[np.argsort(points[:, 2])[:count]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "cells", "count", "limits"),
-    [
-        ("tiny", 10, 500, (0.03, 0.15)),
-        pytest.param("small", 12, 1200, (0.02, 0.08), marks=pytest.mark.slow),
-        pytest.param("paper", 18, 4000, (0.02, 0.02), marks=pytest.mark.slow),
-    ],
+    [("tiny", 10, 500, (0.03, 0.15)), ("small", 12, 1200, (0.02, 0.08)), ("paper", 18, 4000, (0.02, 0.02))],
 )
 def test_volume_at_rest_in_the_bowl_of_the_data(physics, size, cells, count, limits):
     """Scenes of ``data=fluid`` after the liquid has come to rest; its volume in two ways, the worst of two scenes.

@@ -29,6 +29,7 @@ def test_counts_nodes_frames_and_substeps():
     assert timing.num_bytes > timing.num_nodes * 4 * 4 * 4 and timing.num_stored_bytes > 0
 
 
+@pytest.mark.slow
 def test_table_has_a_row_per_case():
     settings = Settings({"sand": Case([*TINY, "data=sand"], "10 per minute")}, num_trajectories=2, num_frames=3, num_workers=1)
     records, table = run(settings, {"sand": dataset_spec(compose("simulate", *settings.cases["sand"].overrides))})

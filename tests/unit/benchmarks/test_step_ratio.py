@@ -30,6 +30,7 @@ def sand(monkeypatch: pytest.MonkeyPatch) -> DatasetSpec:
     return dataset("data=sand", "size=small")
 
 
+@pytest.mark.slow
 def test_every_record_has_its_place_in_the_table(sand: DatasetSpec) -> None:
     records = step_records({"sand": sand}, num_rounds=1)
     found = {r["metric"]: r["value"] for r in records}

@@ -211,6 +211,7 @@ def test_killed_at_random_moments(tmp_path, data):
     assert not validate([killed]).violations
 
 
+@pytest.mark.slow
 def test_a_data_set_that_is_deleted_meanwhile_can_be_made_again(tmp_path):
     def delete_once(done, total):
         if done == 2:
@@ -267,6 +268,7 @@ def test_data_of_another_version_of_the_solver_are_refused(tmp_path):
         generate(tmp_path, few)
 
 
+@pytest.mark.slow
 def test_what_the_solver_does_not_resolve_is_said(tmp_path, caplog):
     """Viscosities below the grid's own; where data are complete, nothing is said again."""
     spec = replace(dataset("data=fluid", "dimension=2", "size=tiny"), num_train=1, num_val=0, num_test=0, num_test_unseen=0, num_frames=3)
@@ -528,6 +530,7 @@ def fraction_settled(trajectory, time):
     return float(np.mean(np.any(np.linalg.norm(trajectory.vel[: frame + 1] - ballistic, axis=-1) > 0.1, axis=0)))
 
 
+@pytest.mark.slow
 def test_contact_is_not_rare():
     """By frame 50 most particles of the configured scenes have met a wall, an obstacle or others: half on average, and half in 90 % of the scenes."""
     spec = dataset_spec(compose("simulate", "size=small"))

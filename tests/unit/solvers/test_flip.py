@@ -325,6 +325,7 @@ def test_grid_is_shared():
     assert solver().grid is make_grid(((0.0, 1.0),) * 2, 1 / 16)
 
 
+@pytest.mark.slow
 def test_compile_kernels_leaves_nothing_to_compile():
     """Every kernel has one specialisation, which serves 2D and 3D."""
     script = """

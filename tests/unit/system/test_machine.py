@@ -84,6 +84,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) * resource.g
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="its allocator is not glibc's")
 def test_memory_of_freed_arrays_is_not_cleared_again() -> None:
     """Counts the new memory of twenty arrays, one after the other, in units of one array. Huge pages reduce the number of pages."""

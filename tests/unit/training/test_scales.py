@@ -159,10 +159,11 @@ def in_units(metric: str, length: float, time: float) -> float:
     return length ** powers.get("m", 0) / time**below
 
 
-SLOW = [(-20, 0), (0, 12), (-7, -12), (13, 5)]
+POWERS = [(20, -12), (-20, 0), (0, 12), (-7, -12), (13, 5)]
 
 
-@pytest.mark.parametrize(("length", "time"), [(20, -12), *(pytest.param(*powers, marks=pytest.mark.slow) for powers in SLOW)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("length", "time"), POWERS)
 def test_powers_of_two_change_nothing_but_the_units(length: int, time: int, tmp_path: Path, folder: Path) -> None:
     losses, step, rows = in_metres(folder)
     own_losses, own_step, own_rows = trained(folder, tmp_path, 2.0**length, 2.0**time)
