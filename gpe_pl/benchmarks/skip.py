@@ -171,7 +171,8 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     """Measure the cost of each growing scene with its level of skipping on and off.
 
     Returns:
-        Records and a Markdown table. Records hold step times [s], relative overheads, the time of repeated predictions as a ratio, and numbers of calls.
+        Records and a Markdown table. Records hold step times [s], overheads relative to the scene without the added part, the time with repeated predictions
+        over that with a prediction for each frame, and the numbers of calls of layers with a level on and off.
     """
     torch.set_num_threads(settings.num_threads)
     builder, scene = scene_of(settings)

@@ -89,18 +89,19 @@ class TrajectoryDataModule(L.LightningDataModule):
         num_val_windows: number of windows of the one-step validation loss, evenly spread over the ``val`` split.
         stress: add the stress to samples; see ``WindowDataset``.
         sampling: how often each training window is drawn.
+        num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
         solver: gives the targets of noisy and unrolled states; see ``WindowDataset``.
         mirror: mirror training windows at random; see ``WindowDataset``.
-        unroll_steps: number of steps of an unroll with gradients; see ``WindowDataset``.
-        num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
         stride: number of stored frames in a frame of the model. Training windows begin at any stored frame, validation windows at every ``stride``-th.
+        unroll_steps: number of steps of an unroll with gradients; see ``WindowDataset``.
 
     Attributes:
         push_forward: settings of the push-forward trick; None if it is not used. In steps with push-forward, batches contain starts of unrolls instead of
             graphs.
 
     Raises:
-        StoreError: a split or its statistics are missing or damaged, or no trajectory of a split is long enough for a window.
+        StoreError: a split or its statistics are missing or damaged, too many of its trajectories cannot be used, none is long enough for a window, or a node
+            may move by half a period within a frame of this stride.
         NoiseError: the noise is too large for the spacing of the data.
     """
 

@@ -65,7 +65,10 @@ class FreeFlight:
 
     @property
     def typical(self) -> np.ndarray:
-        """Median acceleration of the groups [dim] in m/s². Components below their scatter are 0. There must be at least one free group."""
+        """Median acceleration of the free groups [dim] in m/s², of which there must be at least one.
+
+        A component is 0 unless it exceeds both the median deviation of the groups from it and their median ``resolution``.
+        """
         middle = np.median(self.acceleration, axis=0)
         noise = np.maximum(np.median(np.abs(self.acceleration - middle), axis=0), np.median(self.resolution))
         return np.where(np.abs(middle) > noise, middle, 0.0)

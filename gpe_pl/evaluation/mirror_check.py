@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.predictions import start_of
-from gpe_pl.evaluation.settings import StartError
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.mirror import equivariance_error
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import rollouts
 from gpe_pl.rollout.mirrored import Mirrored
 from gpe_pl.trajectory.trajectory import Trajectory
+
+
+class MirrorError(GpeError, ValueError):
+    """Raised for a scene whose mirror images all fall another way, because gravity acts along every axis."""
 
 
 def mirror_equivariance_error(simulator: LearnedSimulator, trajectory: Trajectory, start_frame: int | None = None) -> float:
@@ -24,14 +28,14 @@ def mirror_equivariance_error(simulator: LearnedSimulator, trajectory: Trajector
         start_frame: frame at which the rollouts start; None takes the first with enough history.
 
     Raises:
-        StartError: gravity acts along every axis.
+        MirrorError: gravity acts along every axis.
         IndexError: there are too few frames before ``start_frame``.
         SceneError: the scene does not fit the simulator.
     """
     metadata, history = trajectory.metadata, simulator.builder.config.history
     level = [axis for axis, pull in enumerate(metadata.gravity) if pull == 0]
     if not level:
-        raise StartError(f"gravity {metadata.gravity} m/s² acts along every axis, so no mirror image of the scene falls the same way")
+        raise MirrorError(f"gravity {metadata.gravity} m/s² acts along every axis, so no mirror image of the scene falls the same way")
     first = history if start_frame is None else start_frame
     start = start_of(simulator, first, trajectory, trajectory.frames(first))
     mirrored = Mirrored(simulator, level[0], sum(metadata.bounds[level[0]]) / 2)

@@ -14,7 +14,7 @@ Export = Literal["vtk", "npz", "mp4", "model"]
 
 
 class StartError(GpeError, ValueError):
-    """Raised when rollouts cannot start: the start frame has too few frames before it, or gravity leaves no mirror image of the scene."""
+    """Raised if ``start_time`` leaves too few frames before it, or is between two frames."""
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,11 @@ def verdict(runs: Sequence[Run]) -> str:
 
 
 def material_lines(groups: Groups) -> list[str]:
-    """Return the table of all models with controls in Markdown; empty if there is none."""
+    """Return a table in Markdown, and a note below it, which show whether models read the material parameter.
+
+    Each group of runs that has controls, and shares scenes with interpolated parameters, has a row with errors and their ratios. Without such a group there is
+    no table.
+    """
     shown = {key: runs for key, runs in groups.items() if reads_material(runs) is not None}
     if not shown:
         return []

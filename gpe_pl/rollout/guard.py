@@ -161,8 +161,8 @@ class Guard:
     def of(self, start: State) -> Guard:
         """Return the guard for a rollout from a state, which may be denser than usual.
 
-        Its ``max_crowding`` is at least twice the number of nodes in the densest cell of the state. It is not raised if more nodes than ``max_crowding``
-        coincide.
+        ``max_crowding`` is raised to twice the number of nodes in the densest cell of the state, if that is more. The guard is returned unchanged if more than
+        ``max_crowding`` nodes coincide (see ``FINEST``), if ``spacing`` is 0, or if the state is empty or not finite.
         """
         if self.spacing == 0 or start.num_nodes == 0 or self._not_finite(start, 0) is not None:
             return self

@@ -120,7 +120,14 @@ def parameter_columns(
 
 @runtime_checkable
 class Surroundings(Protocol):
-    """Settings of a scene that determine the friction of its walls and obstacles."""
+    """Settings from which the walls of a scene, and the friction of walls and obstacles, are drawn.
+
+    Attributes:
+        bounds: ``(low, high)`` of the domain for each axis [m].
+        sticky_probability: probability that a surface is no-slip.
+        slip_probability: probability that a surface has no friction.
+        coulomb_friction: ``(low, high)`` of the friction coefficients of all other surfaces.
+    """
 
     @property
     def bounds(self) -> tuple[tuple[float, float], ...]: ...

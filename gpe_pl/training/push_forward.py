@@ -80,9 +80,14 @@ class Excursions:
         self._loaded = {lane: dict(scenes) for lane, scenes in stored.items()}
 
     def graphs(self, simulator: LearnedSimulator, starts: Sequence[UnrollStart]) -> HeteroData:
-        """Return a batch of graphs of the states that the unrolls have reached.
+        """Return a batch of graphs of the states that the unrolls of a lane have reached.
 
-        Scenes whose unroll failed or passed the last ground-truth frame restart.
+        If the lane has other samples than ``starts``, these replace them. The new unrolls continue from a loaded checkpoint, or are made first. A scene whose
+        unroll failed or passed the last ground-truth frame restarts.
+
+        Args:
+            simulator: makes unrolls and graphs.
+            starts: starts of the scenes of one lane.
         """
         samples, lane = [start.sample for start in starts], starts[0].lane
         under_way = self._lanes.get(lane)

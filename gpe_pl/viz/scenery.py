@@ -1,4 +1,4 @@
-"""Walls, obstacles, containers and terrain behind the particles.
+"""Draws walls, obstacles, containers and terrain, and finds the particles of a 3D scene that they hide.
 
 In 3D, a surface is shown only if its free side faces the viewer. A viewer outside a container therefore sees its inside, and the near bank of a river is not
 drawn.

@@ -144,7 +144,7 @@ def predicted(candidate: Candidate, state: State, truth: Trajectory) -> tuple[Tr
 
 
 def listed(values: Sequence[float]) -> str:
-    """Return numbers as text with three digits; NaN, for a rollout that ended early, is ``stopped``."""
+    """Return numbers as text with three significant digits, separated by commas. NaN stands for a rollout that ended early, and becomes ``stopped``."""
     return ", ".join("stopped" if math.isnan(v) else f"{v:.3g}" for v in values)
 
 

@@ -107,11 +107,11 @@ def _fifo(path: Path) -> None:
 
 
 def changes(is_table: bool, seed: int = 0) -> Iterator[tuple[str, Change]]:
-    """Yield name and function of every change of a small file.
+    """Yield the name and function of every way to damage a small file.
 
     Args:
-        is_table: whether the file is a JSON table; then further changes replace a value by one of another type.
-        seed: seed for the choice of the changed number or value.
+        is_table: whether the file is a JSON table. Further changes then replace a value by one of another type.
+        seed: determines which number or value is replaced.
     """
     for name in _TEXTS:
         yield name, partial(_text, name)

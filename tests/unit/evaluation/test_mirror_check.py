@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gpe_pl.evaluation.mirror_check import mirror_equivariance_error
-from gpe_pl.evaluation.settings import StartError
+from gpe_pl.evaluation.mirror_check import MirrorError, mirror_equivariance_error
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -34,5 +33,5 @@ def test_the_image_of_a_scene_moves_like_its_image() -> None:
 def test_gravity_along_every_axis_has_no_mirror() -> None:
     scene = path()
     tilted = replace(scene, metadata=replace(scene.metadata, gravity=(1.0, -9.0)))
-    with pytest.raises(StartError, match="every axis"):
+    with pytest.raises(MirrorError, match="every axis"):
         mirror_equivariance_error(model(scene, 0.0), tilted)
