@@ -25,22 +25,29 @@ class Packed(NamedTuple):
         starts: index in ``numbers`` at which the values of each shape start, and the total number of values [shape + 1].
         numbers: values that define the shapes, such as centres and radii, one shape after the other.
         others: shapes of kinds that the compiled pass does not cover.
+        extent: largest ``Shape.extent`` [m].
     """
 
     kinds: np.ndarray
     starts: np.ndarray
     numbers: np.ndarray
     others: tuple[Any, ...]
+    extent: float
 
 
 def compiled_distance(shapes: tuple[Any, ...], points: np.ndarray) -> np.ndarray:
     """Return the signed distance [point] in m of points [point, dim], negative inside any of the shapes; +inf without shapes."""
-    packed = _packed(shapes)
+    packed = packed_shapes(shapes)
     distance = np.empty(len(points))
     _nearest(np.ascontiguousarray(points), packed.kinds, packed.starts, packed.numbers, distance)
     for shape in packed.others:
         distance = np.minimum(distance, shape.signed_distance(points))
     return distance
+
+
+def has_compiled_distance(shapes: tuple[Any, ...]) -> bool:
+    """Tell whether the numbers of all these shapes are known, so that compiled loops can use them."""
+    return not packed_shapes(shapes).others
 
 
 def _wall(shape: Any) -> list[float]:
@@ -76,7 +83,7 @@ _NUMBERS: dict[str, tuple[int, Callable[[Any], Any]]] = {
 _kept: dict[int, tuple[tuple[Any, ...], Packed]] = {}
 
 
-def _packed(shapes: tuple[Any, ...]) -> Packed:
+def packed_shapes(shapes: tuple[Any, ...]) -> Packed:
     """Return the numbers of shapes, made once per tuple: all states of a rollout have the same one."""
     found = _kept.get(id(shapes))
     if found is not None and found[0] is shapes:
@@ -88,6 +95,7 @@ def _packed(shapes: tuple[Any, ...]) -> Packed:
         np.cumsum([0, *map(len, parts)]),
         np.concatenate([np.empty(0), *parts]),
         tuple(shape for shape in shapes if shape.kind not in _NUMBERS),
+        max((shape.extent for shape in shapes), default=0.0),
     )
     if len(_kept) >= _MOST_KEPT:
         _kept.clear()
@@ -99,23 +107,58 @@ def _packed(shapes: tuple[Any, ...]) -> Packed:
 @no_type_check
 def _nearest(points, kinds, starts, numbers, distance):
     for n in range(points.shape[0]):
-        nearest = math.inf
-        for s in range(kinds.shape[0]):
-            if kinds[s] == _WALL:
-                first = starts[s]
-                d = points[n, int(numbers[first])] * numbers[first + 1] - numbers[first + 2]
-            elif kinds[s] == _BOX:
-                d = _of_box(points[n], numbers, starts[s])
-            elif kinds[s] == _POLYGON:
-                d = _of_polygon(points[n], numbers, starts[s], starts[s + 1])
-            elif kinds[s] == _GRID:
-                d = _of_grid(points[n], numbers, starts[s])
-            else:
-                d = _of_sphere(points[n], numbers, starts[s])
-                d = -d if kinds[s] == _BOWL else d
-            if d < nearest or math.isnan(d):
-                nearest = d
-        distance[n] = nearest
+        distance[n] = nearest_of(points[n], kinds, starts, numbers)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def nearest_of(x, kinds, starts, numbers):
+    """Return the signed distance of a point [dim] to the nearest of the shapes."""
+    nearest = math.inf
+    for s in range(kinds.shape[0]):
+        d = distance_to(x, s, kinds, starts, numbers)
+        if d < nearest or math.isnan(d):
+            nearest = d
+    return nearest
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def distance_to(x, s, kinds, starts, numbers):
+    """Return the signed distance of a point [dim] to shape number s."""
+    first = starts[s]
+    if kinds[s] == _WALL:
+        return x[int(numbers[first])] * numbers[first + 1] - numbers[first + 2]
+    if kinds[s] == _BOX:
+        return _of_box(x, numbers, first)
+    if kinds[s] == _POLYGON:
+        return _of_polygon(x, numbers, first, starts[s + 1])
+    if kinds[s] == _GRID:
+        return _of_grid(x, numbers, first)
+    d = _of_sphere(x, numbers, first)
+    return -d if kinds[s] == _BOWL else d
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def write_normal(x, s, kinds, starts, numbers, step, normal):
+    """Write the ``shapes.outward_normal`` of shape number s at a point [dim] to ``normal``."""
+    normal[:] = 0.0
+    if kinds[s] == _WALL:
+        normal[int(numbers[starts[s]])] = numbers[starts[s] + 1]
+        return
+    near, squared = x.copy(), 0.0
+    for a in range(x.shape[0]):
+        near[a] = x[a] + step
+        ahead = distance_to(near, s, kinds, starts, numbers)
+        near[a] = x[a] - step
+        normal[a] = ahead - distance_to(near, s, kinds, starts, numbers)
+        near[a] = x[a]
+        squared += normal[a] * normal[a]
+    if squared > 0.0:
+        length = math.sqrt(squared)
+        for a in range(x.shape[0]):
+            normal[a] /= length
 
 
 @njit(cache=True, error_model="numpy")

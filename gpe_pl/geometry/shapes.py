@@ -19,7 +19,7 @@ import numpy as np
 from array_api_compat import array_namespace, device
 
 from gpe_pl.errors import GpeError
-from gpe_pl.geometry.compiled_distance import compiled_distance
+from gpe_pl.geometry.compiled_distance import compiled_distance, packed_shapes
 
 Array = Any
 
@@ -511,7 +511,7 @@ def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:
 
 def surface_tolerance(shapes: tuple[Shape, ...]) -> float:
     """Return the distance [m] below which a point counts as on a surface: ``ON_SURFACE`` times the largest shape's extent, so that units do not matter."""
-    return ON_SURFACE * max((shape.extent for shape in shapes), default=0.0)
+    return ON_SURFACE * packed_shapes(shapes).extent
 
 
 def thickness(shape: Shape) -> float:

@@ -7,9 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from array_api_compat import array_namespace, device
 
+from gpe_pl.geometry.compiled_distance import has_compiled_distance
+from gpe_pl.geometry.compiled_surfaces import NUM_PASSES, put_back
 from gpe_pl.geometry.shapes import Shape, outward_normal, signed_distance, surface_tolerance
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
-from gpe_pl.trajectory.boundary import Array
+from gpe_pl.system.compiled import is_wanted
+from gpe_pl.trajectory.boundary import Array, as_numpy
 from gpe_pl.trajectory.state import State
 
 
@@ -27,9 +30,36 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
         Corrected state (the same object if no node was inside) and a mask [node] of the corrected nodes.
     """
     shapes = state.boundary.shapes
-    pos = state.pos
-    xp = array_namespace(pos)
     tolerance = surface_tolerance(shapes)
+    if not _is_compiled(state):
+        return _contain_plainly(state, dt, tolerance)
+    pos, vel = np.ascontiguousarray(as_numpy(state.pos)), np.ascontiguousarray(as_numpy(state.vel))
+    found = put_back(shapes, pos, vel, dt, tolerance)
+    xp = array_namespace(state.pos)
+    if found is None:
+        return state, xp.zeros(len(pos), dtype=xp.bool)
+    new_pos, new_vel, inside = found
+    if state.periodicity:
+        new_pos[inside] = state.periodicity.wrapped(new_pos[inside])
+    return state.corrected(xp.asarray(new_pos), xp.asarray(new_vel)), xp.asarray(inside)
+
+
+def _is_compiled(state: State) -> bool:
+    """Tell whether compiled loops cover the arrays and shapes of a state."""
+    if not is_wanted() or not has_compiled_distance(state.boundary.shapes):
+        return False
+    pos, vel = state.pos, state.vel
+    if isinstance(pos, np.ndarray):
+        return pos.dtype == vel.dtype == np.float64
+    xp = array_namespace(pos)
+    on_cpu = str(device(pos)) == "cpu" and not pos.requires_grad and not vel.requires_grad
+    return bool(on_cpu and pos.dtype == vel.dtype == xp.float64)
+
+
+def _contain_plainly(state: State, dt: float, tolerance: float) -> tuple[State, Array]:
+    """Return the results of ``contain`` by the methods of the shapes."""
+    shapes, pos = state.boundary.shapes, state.pos
+    xp = array_namespace(pos)
     inside = signed_distance(shapes, pos) < -tolerance
     if not bool(xp.any(inside)):
         return state, inside
@@ -51,7 +81,7 @@ def _plain(points: Array) -> Array:
 def _on_surfaces(shapes: tuple[Shape, ...], points: Array, tolerance: float) -> Array:
     """Move points along the normals of all shapes that they are inside of."""
     xp = array_namespace(points)
-    for _ in range(4):  # corners need a pass per surface
+    for _ in range(NUM_PASSES):
         if not bool(xp.any(signed_distance(shapes, points) < 0)):
             break
         for shape in shapes:

@@ -9,8 +9,21 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, domain_walls, outward_normal, signed_distance, surface_tolerance
+from gpe_pl.geometry.periodicity import Periodicity
+from gpe_pl.geometry.shapes import (
+    Bowl,
+    Box,
+    DistanceGrid,
+    Polygon,
+    Shape,
+    Sphere,
+    domain_walls,
+    outward_normal,
+    signed_distance,
+    surface_tolerance,
+)
 from gpe_pl.rollout.containment import Contained, contain
+from gpe_pl.system.compiled import unfused
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 from tests import scenes
@@ -77,6 +90,37 @@ def test_numpy_and_torch_agree() -> None:
     np.testing.assert_array_equal(torch_mask, mask)
     assert isinstance(b.pos, torch.Tensor)
     assert b.velocity_history is None
+
+
+GRID = DistanceGrid.from_values((0.0, 0.0), 0.1, np.add.outer(0.4 - np.linspace(0, 1, 11), np.linspace(0, 0.5, 11)), 0.3)
+
+
+@pytest.mark.parametrize("shapes", [WALLS + OBSTACLES, WALLS + WEDGES, (Bowl((0.5, 0.5), 0.4, 0.3),), (*WALLS, GRID)])
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+@pytest.mark.parametrize("length", [0.05, 0.3])
+def test_the_compiled_pass_equals_the_plain_one(shapes: tuple[Shape, ...], backend: str, length: float) -> None:
+    before, after = steps_from_free_space(shapes, length, count=500)
+    state = moved(shapes, before, after, history=2)
+    state = state.to_torch() if backend == "torch" else state
+    found, mask = contain(state, DT)
+    with unfused():
+        expected, expected_mask = contain(state, DT)
+    np.testing.assert_array_equal(mask, expected_mask)
+    assert np.asarray(mask).any()
+    for name in ("pos", "vel", "velocity_history"):
+        assert type(getattr(found, name)) is type(getattr(expected, name))
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-12, atol=1e-12)
+
+
+def test_the_compiled_pass_wraps_nodes_into_a_periodic_domain() -> None:
+    space = Periodicity(((0.0, 1.0), (0.0, 1.0)), (True, False))
+    state = moved((Box((-0.1, 0.4), (0.05, 0.6), 0.3),), np.array([[-0.12, 0.5]]), np.array([[-0.09, 0.5]]))
+    state = replace(state, periodicity=space)
+    found, _ = contain(state, DT)
+    with unfused():
+        expected, _ = contain(state, DT)
+    assert 0 <= float(found.pos[0, 0]) < 1
+    np.testing.assert_allclose(found.pos, expected.pos, rtol=0, atol=1e-12)
 
 
 def test_a_node_comes_back_along_the_normal() -> None:
