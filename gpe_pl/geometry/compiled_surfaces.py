@@ -78,38 +78,40 @@ def _put_back(vel, dt, kinds, starts, numbers, tolerance, inside, new_pos, new_v
 
 
 def write_nearest_surfaces(
-    shapes: tuple[Any, ...], pos: np.ndarray, is_near: np.ndarray, step: float, most_friction: float, found: np.ndarray
+    shapes: tuple[Any, ...], pos: np.ndarray, rows: np.ndarray, is_near: np.ndarray, step: float, most_friction: float, found: np.ndarray
 ) -> None:
-    """Write normal, distance [m] and friction of the nearest shape of some points to ``found`` [point, dim + 2], and zeros for other points.
+    """Write normal, distance [m] and friction of the nearest shape of some points to ``found`` [row, dim + 2], and zeros for other points.
 
     Args:
         shapes: shapes that ``packed_shapes`` knows, at least one.
         pos: positions [point, dim] in m.
-        is_near: mask [point] of the points to look at.
+        rows: points of the results [row].
+        is_near: mask [row] of the points to look at.
         step: step of the differences that give the normals [m].
         most_friction: upper limit of the friction.
         found: the results.
     """
     packed = packed_shapes(shapes)
     friction = np.array([min(shape.friction, most_friction) for shape in shapes])
-    _write_nearest_surfaces(pos, is_near, packed.kinds, packed.starts, packed.numbers, friction, step, found)
+    _write_nearest_surfaces(pos, rows, is_near, packed.kinds, packed.starts, packed.numbers, friction, step, found)
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def _write_nearest_surfaces(pos, is_near, kinds, starts, numbers, friction, step, found):
+def _write_nearest_surfaces(pos, rows, is_near, kinds, starts, numbers, friction, step, found):
     dim = pos.shape[1]
     normal = np.empty(dim)
-    for n in range(pos.shape[0]):
-        found[n] = 0.0
-        if not is_near[n]:
+    for k in range(rows.shape[0]):
+        found[k] = 0.0
+        if not is_near[k]:
             continue
-        chosen, least = 0, distance_to(pos[n], 0, kinds, starts, numbers)
+        x = pos[rows[k]]
+        chosen, least = 0, distance_to(x, 0, kinds, starts, numbers)
         for s in range(1, kinds.shape[0]):
-            d = distance_to(pos[n], s, kinds, starts, numbers)
+            d = distance_to(x, s, kinds, starts, numbers)
             if d < least:
                 chosen, least = s, d
-        write_normal(pos[n], chosen, kinds, starts, numbers, step, normal)
+        write_normal(x, chosen, kinds, starts, numbers, step, normal)
         for a in range(dim):
-            found[n, a] = normal[a]
-        found[n, dim], found[n, dim + 1] = least, friction[chosen]
+            found[k, a] = normal[a]
+        found[k, dim], found[k, dim + 1] = least, friction[chosen]

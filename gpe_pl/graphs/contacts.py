@@ -21,6 +21,8 @@ BLUNTEST = 0.42
 the angle is below 130°. On a disc with a radius of three spacings the length is 0.17."""
 MOST_FRICTION = 1e6
 """Largest Coulomb coefficient."""
+NORMAL_STEP = 1e-4
+"""Step of the differences of distances that give normals [rest spacings]."""
 
 
 def nearest_walls(
@@ -76,25 +78,19 @@ def _nearest_shapes(pos: Tensor, shapes: Sequence[Shape], spacing: float) -> Ten
     found[:, -2] = distance[nearest, np.arange(len(points))]
     for number in np.unique(nearest):
         own = nearest == number
-        found[own, :-2] = outward_normal(shapes[number], points[own], 1e-4 * spacing)
+        found[own, :-2] = outward_normal(shapes[number], points[own], NORMAL_STEP * spacing)
         found[own, -1] = min(shapes[number].friction, MOST_FRICTION)
     return torch.from_numpy(found).to(pos.device)
 
 
 def corners_near_edges(
-    pos: Float64[Tensor, "node 2"],
-    rest_pos: Float64[Tensor, "node 2"],
-    cells: Int64[Tensor, "cell corner"],
-    boundary: Boundary,
-    spacing: float,
-    radius: float,
+    pos: Float64[Tensor, "node 2"], edges: Int64[np.ndarray, "edge 2"], boundary: Boundary, spacing: float, radius: float
 ) -> tuple[Int64[Tensor, "pair 2"], Float64[Tensor, "pair 3"]]:
     """Return the pairs of a convex corner of an obstacle and an edge on the surface of a body, in 2D, whose distance is below ``radius``.
 
     Args:
         pos: positions of the nodes of bodies [m].
-        rest_pos: their positions at rest [m].
-        cells: their cells [cell, corner], all with the same orientation.
+        edges: nodes of the edges, see ``oriented_edges``.
         boundary: boundary nodes.
         spacing: rest spacing [m].
         radius: largest distance of a corner from the middle of an edge [m].
@@ -103,20 +99,36 @@ def corners_near_edges(
         For each pair the nodes at the ends of the edge, with the body on the left of the edge; and the vector from the first of these nodes to the corner [m]
         with the friction of the corner.
     """
-    edges, corner = surface_edges(cells.cpu().numpy()), convex_corners(boundary, spacing)
-    if not len(edges) or not len(corner):
-        return torch.empty(0, 2, dtype=torch.int64, device=pos.device), pos.new_empty(0, 3)
-    a, b, c = rest_pos[cells[0, :3]]
-    if (b - a)[0] * (c - b)[1] < (b - a)[1] * (c - b)[0]:  # clockwise: the cells of a mirror image
-        edges = edges[:, ::-1]
+    corner = convex_corners(boundary, spacing)
     where, point = as_numpy(pos), as_numpy(boundary.pos)[corner]
     middle = 0.5 * (where[edges[:, 0]] + where[edges[:, 1]])
     edge, which = np.nonzero(((middle[:, None] - point[None]) ** 2).sum(axis=2) < radius**2)
     ends = edges[edge]
-    way = point[which] - where[ends[:, 0]]
-    friction = np.minimum(as_numpy(boundary.friction)[corner[which]], MOST_FRICTION)
-    values = np.concatenate([way, friction[:, None]], axis=1)
-    return torch.from_numpy(np.ascontiguousarray(ends)).to(pos.device), torch.from_numpy(values).to(pos)
+    values = beside_first_node(where[ends[:, 0]], boundary, corner[which])
+    return torch.from_numpy(ends).to(pos.device), torch.from_numpy(values).to(pos)
+
+
+def beside_first_node(
+    first: Float64[np.ndarray, "pair 2"], boundary: Boundary, corner: Int64[np.ndarray, " pair"]
+) -> Float64[np.ndarray, "pair 3"]:
+    """Return the way from the first nodes of edges to corners [m], and the friction of the corners, which are given as rows of the boundary."""
+    friction = np.minimum(as_numpy(boundary.friction)[corner], MOST_FRICTION)
+    return np.concatenate([as_numpy(boundary.pos)[corner] - first, friction[:, None]], axis=1)
+
+
+def oriented_edges(rest_pos: Float64[Tensor, "node 2"], cells: Int64[Tensor, "cell corner"]) -> Int64[np.ndarray, "edge 2"]:
+    """Return ``surface_edges`` of plane cells, all in one sense, with the body on the left of each edge.
+
+    Args:
+        rest_pos: positions of nodes at rest [m].
+        cells: corners of the cells.
+    """
+    edges = surface_edges(cells.cpu().numpy())
+    if not len(edges):
+        return edges
+    a, b, c = rest_pos[cells[0, :3]]
+    is_clockwise = (b - a)[0] * (c - b)[1] < (b - a)[1] * (c - b)[0]  # the cells of a mirror image
+    return np.ascontiguousarray(edges[:, ::-1]) if is_clockwise else edges
 
 
 def convex_corners(boundary: Boundary, spacing: float) -> np.ndarray:

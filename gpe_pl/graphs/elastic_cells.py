@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
-from gpe_pl.graphs.contacts import corners_near_edges, nearest_walls
+from gpe_pl.geometry.compiled_distance import has_compiled_distance
+from gpe_pl.geometry.compiled_surfaces import write_nearest_surfaces
+from gpe_pl.graphs import compiled_cells
+from gpe_pl.graphs.compiled_graph import NO_ROWS, works_on
+from gpe_pl.graphs.contacts import (
+    MOST_FRICTION,
+    NORMAL_STEP,
+    beside_first_node,
+    convex_corners,
+    corners_near_edges,
+    nearest_walls,
+    oriented_edges,
+)
 from gpe_pl.graphs.features import Scales, from_centre
+from gpe_pl.graphs.search import as_array
 from gpe_pl.graphs.topology import GraphError, Topology
 from gpe_pl.schema import BOUNDARY, RADIUS, FeatureSpec
 from gpe_pl.trajectory.state import State
+
+NO_EDGES = np.empty((0, 2), np.int64)
 
 
 def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureSpec, scales: Scales, precision: torch.dtype) -> None:
@@ -27,32 +46,125 @@ def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureS
     Raises:
         GraphError: cells are surfaces or of several kinds, or walls move.
     """
-    device, dim, boundary = state.pos.device, spec.dim, state.boundary
-    if boundary.motion is not None or bool((boundary.vel != 0).any()):
+    dim, boundary = spec.dim, state.boundary
+    if boundary.motion is not None or boundary.made_once("moves", lambda: bool((boundary.vel != 0).any())):
         raise GraphError("graph.cells=true needs walls at rest, the walls of this scene move; choose graph.cells=false model.elastic=false")
     data.gravity = (state.gravity[None] * scales.frame_dt**2).to(precision)
-    at_frame = state.vel if state.frame_velocity is None else state.frame_velocity
-    mesh, islands = topology.mesh, topology.islands
+    compiled = works_on(state)
     for material in spec.meshes:
-        store, rows = data[material], topology.rows[material]
-        pos = state.pos[rows]
-        edges = _in_state(topology.edges.get((BOUNDARY, RADIUS, material)), topology.boundary_rows)
-        store.wall = nearest_walls(pos, boundary, boundary.shapes, edges, scales.spacing, topology.periodicity).to(precision)
-        store.velocity = (torch.cat([state.vel[rows], at_frame[rows]], dim=1) * scales.frame_dt).to(precision)
-        store.corner_index, store.corner = torch.empty(0, 2, dtype=torch.int64, device=device), store.velocity.new_empty(0, dim + 1)
-        store.body_pos, store.rest_pos = (torch.zeros_like(pos, dtype=precision) for _ in range(2))
-        store.cell_index = torch.empty(0, 2**dim, dtype=torch.int64, device=device)
-        if mesh is None or islands is None or state.cells is None or not len(rows):
-            continue
+        at_rest = _at_rest(topology, state, material, dim, precision)
+        entries = (_entries_in_compiled_loops if compiled else _entries)(topology, state, material, at_rest, scales, precision)
+        data[material].update({"cell_index": at_rest.cell_index, "rest_pos": at_rest.pos, **entries})
+
+
+def _entries(
+    topology: Topology, state: State, material: str, at_rest: _AtRest, scales: Scales, precision: torch.dtype
+) -> dict[str, Tensor]:
+    """Return the entries of a material that change from frame to frame."""
+    rows, mesh, islands = topology.rows[material], topology.mesh, topology.islands
+    at_frame = state.vel if state.frame_velocity is None else state.frame_velocity
+    pos, dim = state.pos[rows], state.pos.shape[1]
+    entries = {
+        "wall": _walls(topology, state, material, scales).to(precision),
+        "velocity": (torch.cat([state.vel[rows], at_frame[rows]], dim=1) * scales.frame_dt).to(precision),
+        "body_pos": torch.zeros_like(pos, dtype=precision),
+    }
+    if mesh is not None and islands is not None and len(at_rest.cell_index):
         now = pos if mesh.shift is None else pos + mesh.shift[rows]
-        rest = mesh.rest_pos[rows]
-        store.body_pos, store.rest_pos = (from_centre(x, islands.body[material], islands.num_bodies).to(precision) for x in (now, rest))
-        cells = _cells(state, rows, material, dim)
+        entries["body_pos"] = from_centre(now, islands.body[material], islands.num_bodies).to(precision)
+    ends, corner = pos.new_empty(0, 2, dtype=torch.int64), pos.new_empty(0, dim + 1)
+    if len(at_rest.surface) and not topology.periodicity:
+        ends, corner = corners_near_edges(pos, at_rest.surface, state.boundary, scales.spacing, scales.radius)
+    return entries | {"corner_index": ends, "corner": corner.to(precision)}
+
+
+def _entries_in_compiled_loops(
+    topology: Topology, state: State, material: str, at_rest: _AtRest, scales: Scales, precision: torch.dtype
+) -> dict[str, Tensor]:
+    """Return ``_entries`` of a state for which ``compiled_graph.works_on`` is true."""
+    pos, vel, rows = as_array(state.pos), as_array(state.vel), topology.rows[material].numpy()
+    at_frame = vel if state.frame_velocity is None else as_array(state.frame_velocity)
+    (num_rows, dim), dtype, boundary, mesh, islands = (
+        (len(rows), pos.shape[1]),
+        at_rest.dtype,
+        state.boundary,
+        topology.mesh,
+        topology.islands,
+    )
+    velocity, body_pos = np.empty((num_rows, 2 * dim), dtype), np.zeros((num_rows, dim), dtype)
+    compiled_cells.write_velocities(vel, at_frame, rows, scales.frame_dt, velocity)
+    if mesh is not None and islands is not None and len(at_rest.cell_index):
+        shift = NO_ROWS if mesh.shift is None else as_array(mesh.shift)
+        compiled_cells.write_from_centre(pos, shift, rows, islands.body[material].numpy(), islands.num_bodies, body_pos)
+    if boundary.shapes and has_compiled_distance(boundary.shapes):
+        is_near, wall = np.zeros(num_rows, np.bool_), np.empty((num_rows, dim + 2), dtype)
+        touching = topology.edges.get((BOUNDARY, RADIUS, material))
+        if touching is not None:
+            is_near[touching[1].numpy()] = True
+        write_nearest_surfaces(boundary.shapes, pos, rows, is_near, NORMAL_STEP * scales.spacing, MOST_FRICTION, wall)
+        walls = torch.from_numpy(wall)
+    else:
+        walls = _walls(topology, state, material, scales).to(precision)
+    ends, corner = np.empty((0, 2), np.int64), np.empty((0, dim + 1), dtype)
+    if len(at_rest.surface) and not topology.periodicity:
+        corners, points = convex_corners(boundary, scales.spacing), as_array(boundary.pos)
+        pairs = compiled_cells.near_corners(pos, rows, at_rest.surface, points, corners, scales.radius**2)
+        if len(pairs):
+            ends = at_rest.surface[pairs[:, 0]]
+            corner = beside_first_node(pos[rows[ends[:, 0]]], boundary, corners[pairs[:, 1]]).astype(dtype)
+    found = {"velocity": velocity, "body_pos": body_pos, "corner_index": ends, "corner": corner}
+    return {"wall": walls} | {name: torch.from_numpy(values) for name, values in found.items()}
+
+
+def _walls(topology: Topology, state: State, material: str, scales: Scales) -> Tensor:
+    edges = _in_state(topology.edges.get((BOUNDARY, RADIUS, material)), topology.boundary_rows)
+    return nearest_walls(
+        state.pos[topology.rows[material]], state.boundary, state.boundary.shapes, edges, scales.spacing, topology.periodicity
+    )
+
+
+@dataclass(frozen=True)
+class _AtRest:
+    """What the bodies of a material have in all frames.
+
+    Attributes:
+        pos: undeformed positions relative to the mean of the body [node, dim] in m; zero without cells.
+        cell_index: corners of each cell [cell, 2^dim].
+        surface: nodes of the edges at the surface of bodies in 2D, the body on the left [edge, 2]; empty in 3D.
+        dtype: precision of the entries.
+    """
+
+    pos: Tensor
+    cell_index: Tensor
+    surface: np.ndarray
+    dtype: Any
+
+
+@torch.inference_mode(False)  # a rollout may be the first to ask, and training the next
+def _at_rest(topology: Topology, state: State, material: str, dim: int, precision: torch.dtype) -> _AtRest:
+    """Return what bodies have in all frames. It is kept with the virtual nodes of the mesh, which are the same object in all frames of a scene.
+
+    Raises:
+        GraphError: cells are surfaces or of several kinds.
+    """
+    rows, mesh, islands, device = topology.rows[material], topology.mesh, topology.islands, state.pos.device
+    dtype = np.dtype(str(precision).removeprefix("torch."))
+    if mesh is None or islands is None or state.cells is None or not len(rows):
+        no_cells = torch.empty(0, 2**dim, dtype=torch.int64, device=device)
+        return _AtRest(torch.zeros(len(rows), dim, dtype=precision, device=device), no_cells, NO_EDGES, dtype)
+
+    def make() -> _AtRest:
+        cells, rest = _cells(state, rows, material, dim), mesh.rest_pos[rows]
         padding = cells[:, -1:].expand(-1, 2**dim - cells.shape[1])
-        store.cell_index = torch.cat([cells, padding], dim=1)
-        if dim == 2 and not topology.periodicity:
-            pairs = corners_near_edges(pos, rest, cells, boundary, scales.spacing, scales.radius)
-            store.corner_index, store.corner = pairs[0], pairs[1].to(precision)
+        surface = oriented_edges(rest, cells) if dim == 2 else NO_EDGES
+        centred = from_centre(rest, islands.body[material], islands.num_bodies).to(precision)
+        return _AtRest(centred, torch.cat([cells, padding], dim=1), surface, dtype)
+
+    kept: dict[Any, _AtRest] = mesh.__dict__.setdefault("_cells_at_rest", {})  # not a field, so neither compared nor stored
+    key = material, state.cell_dim, precision
+    if key not in kept:
+        kept[key] = make()
+    return kept[key]
 
 
 def _in_state(edge_index: Tensor | None, boundary_rows: Tensor | None) -> Tensor | None:

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from gpe_pl.geometry.periodicity import Periodicity
+from gpe_pl.geometry.shapes import Box, domain_walls
 from gpe_pl.graphs import compiled_graph
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.compiled_graph import works_on
@@ -65,6 +66,16 @@ def periodic_mesh() -> Scene:
     )
 
 
+def cells(kind: str, materials: tuple[str, ...] = ("elastomer",), shapes: bool = True) -> Scene:
+    """Return bodies whose graphs have cells, with an obstacle beside one of them, and with velocities at the frame."""
+    build, s = meshes(kind, materials, cells=True)
+    corner, dim = s.pos[0], s.pos.shape[1]
+    box = Box(tuple(corner - 3.2 * scenes.SPACING), tuple(corner - 0.2 * scenes.SPACING), 0.4)
+    boundary = Boundary.sample((*domain_walls(((-1.0, 2.0),) * dim, 0.3), box), scenes.SPACING, dim)
+    boundary = boundary if shapes else replace(boundary, shapes=())
+    return build, replace(s, boundary=boundary, frame_velocity=1.1 * s.vel)
+
+
 def moving_walls() -> Scene:
     build, s = particles()
     b, steps = s.boundary, np.arange(4)[:, None, None]
@@ -116,6 +127,10 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "two cells around": lambda: periodic((True, True, False), ("sand",), 0.3),
     "periodic mesh": periodic_mesh,
     "moving walls": moving_walls,
+    "cells": lambda: cells("triangles"),
+    "cells in 3D": lambda: cells("tetrahedra"),
+    "cells of two materials and sand": lambda: cells("lattice", ("sand", "elastomer", "solid")),
+    "cells without shapes": lambda: cells("triangles", shapes=False),
     "further parameters": further_parameters,
     "ties": lattice,
     "scattered": scattered,
@@ -141,6 +156,20 @@ def test_compiled_graphs_equal_plain_ones(scene: str, cls: type[GraphBuilder], t
     assert all(torch.equal(compiled[r].edge_index, plain[r].edge_index) for r in build.spec.relations)
     scenes.assert_equal_graphs(compiled, plain, rtol=tolerance, atol=tolerance)
     assert scene == "one node" or sum(plain[r].edge_index.shape[1] for r in build.spec.relations) > 50
+
+
+def test_cells_have_walls_and_corners_beside_them() -> None:
+    build, s = cells("triangles")
+    store = build(s.to_torch())["elastomer"]
+    assert len(store.corner) and 0 < int((store.wall[:, :2] != 0).any(dim=1).sum()) < s.num_nodes
+
+
+def test_what_bodies_have_at_rest_is_found_once() -> None:
+    build, s = cells("triangles")
+    first, later = build(s.to_torch())["elastomer"], build(replace(s, pos=s.pos + 1e-3).to_torch())["elastomer"]
+    assert first.rest_pos is later.rest_pos and first.cell_index is later.cell_index
+    other = build(replace(s, rest_pos=1.1 * s.rest_pos).to_torch())["elastomer"]
+    torch.testing.assert_close(other.rest_pos, 1.1 * first.rest_pos)
 
 
 def simulator(build: GraphBuilder, s: State, clamps: bool = True, **settings: Any) -> LearnedSimulator:

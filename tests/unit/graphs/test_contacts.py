@@ -8,7 +8,7 @@ import torch
 
 from gpe_pl.geometry.periodicity import NOWHERE
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, domain_walls
-from gpe_pl.graphs.contacts import convex_corners, corners_near_edges, nearest_walls, surface_edges
+from gpe_pl.graphs.contacts import convex_corners, corners_near_edges, nearest_walls, oriented_edges, surface_edges
 from gpe_pl.learned.testing.scenes import mesh
 from gpe_pl.nn.elastic_motion import _in_rounds
 from gpe_pl.trajectory.boundary import Boundary
@@ -68,9 +68,10 @@ def test_edges_have_the_body_on_their_left(is_mirrored: bool) -> None:
     if is_mirrored:
         rest = rest * torch.tensor([-1.0, 1.0])
     pos = rest + torch.tensor([0.5, 0.3]) + 0.1 * SPACING
-    ends, _ = corners_near_edges(pos, rest, cells, boundary(BOX), SPACING, 2 * SPACING)
+    edges = oriented_edges(rest, cells)
+    ends, _ = corners_near_edges(pos, edges, boundary(BOX), SPACING, 2 * SPACING)
     assert not len(ends)  # no corner within reach
-    ends, corner = corners_near_edges(pos - torch.tensor([0.1, 0.0]), rest, cells, boundary(BOX), SPACING, 2 * SPACING)
+    ends, corner = corners_near_edges(pos - torch.tensor([0.1, 0.0]), edges, boundary(BOX), SPACING, 2 * SPACING)
     assert len(ends)
     centre = rest.mean(dim=0)
     first, second = rest[ends[:, 0]], rest[ends[:, 1]]
