@@ -28,7 +28,7 @@ from gpe_pl.nn.connected import Edges, order_of_edges, renumbered, reordered, to
 from gpe_pl.nn.elastic_bodies import CellError, ElasticBodies
 from gpe_pl.nn.fused import works_on
 from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_processor
-from gpe_pl.nn.island_momentum import IslandMomentum, conserve, rigid_part
+from gpe_pl.nn.island_momentum import IslandMomentum, conserve, moved_by_contacts
 from gpe_pl.nn.momentum_conv import RAW, EdgeState, Implementation, Interaction, MomentumConv, orient
 from gpe_pl.schema import CELL, MESH_MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
@@ -162,9 +162,15 @@ def _update(mlp: Any) -> Update:
     return Update(first.weight, first.bias, act.weight, last.weight, last.bias, gain, shift)
 
 
+def _joined(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
 def _grouped(data: HeteroData, materials: Iterable[str], name: str, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return mass, position and group (``island`` or ``body``) of the nodes of these materials; graphs of a batch number their groups from 0."""
     stores = [data[m] for m in materials]
+    if len(stores) == 1 and "batch" not in stores[0]:
+        return stores[0].mass, stores[0].pos, stores[0][name]
     start = torch.cumsum(count, dim=0) - count
     group = torch.cat([s[name] + start[s.batch] if "batch" in s else s[name] for s in stores])
     return torch.cat([s.mass for s in stores]), torch.cat([s.pos for s in stores]), group
@@ -401,21 +407,18 @@ class GPE(Model):
     def _moved_by_contacts(self, data: HeteroData, acceleration: dict[str, Tensor], contact: dict[str, Tensor]) -> dict[str, Tensor]:
         """Replace the rigid part of the accelerations of each body by that of its contacts; graphs without cells have no bodies."""
         mass, pos, body = _grouped(data, contact, "body", data.num_bodies)
-        in_body = torch.cat([data[m].body for m in contact]) >= 0
         count = body.shape[0] if torch.compiler.is_exporting() else int(data.num_bodies.sum())  # upper bound of the number
-        forces, own = torch.cat([*contact.values()]), torch.cat([acceleration[m] for m in contact])
-        groups = torch.where(in_body, body, count), count + 1
-        if self.settings["elastic"]:  # forces act where the contact is, and cells pass them on
-            change = forces - (own if self.settings["only_contacts"] else rigid_part(own, mass, pos, *groups))
-        else:
-            change = rigid_part(forces - own, mass, pos, *groups)
-        parts = torch.where(in_body[:, None], change, 0.0).split([a.shape[0] for a in contact.values()])
-        return acceleration | {m: acceleration[m] + part for m, part in zip(contact, parts, strict=True)}
+        forces, own = _joined([*contact.values()]), _joined([acceleration[m] for m in contact])
+        # with the law, forces act where the contact is, and cells pass them on
+        are_rigid, only_contacts = not self.settings["elastic"], bool(self.settings["only_contacts"])
+        new = moved_by_contacts(own, forces, mass, pos, body, count, are_rigid, only_contacts)
+        parts = new.split([a.shape[0] for a in contact.values()])
+        return acceleration | dict(zip(contact, parts, strict=True))
 
     def _conserve(self, data: HeteroData, acceleration: dict[str, Tensor]) -> dict[str, Tensor]:
         mass, pos, island = _grouped(data, acceleration, "island", data.num_islands)
         angular = self.settings["island_momentum"] == "angular"
-        kept = conserve(torch.cat([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
+        kept = conserve(_joined([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
         return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 
     def _compute_in_order(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 from functools import lru_cache
-from operator import is_
+from operator import attrgetter, is_
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.models.gpe_program import GPEProgram
 from gpe_pl.nn.network_program import Executable, Tables
+from gpe_pl.nn.stores import contents
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import is_symmetric
 
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from gpe_pl.models.gpe import GPE
 
 log = logging.getLogger(__name__)
+
+_changes = attrgetter("_version")
 
 
 class Decoded(NamedTuple):
@@ -64,7 +67,7 @@ class GPEProgramRunner:
         parts = [
             (own, name, part) for m in modules for own in (m._modules, m._parameters) for name, part in own.items() if part is not None
         ]
-        self._places, self._parts = [(own, name) for own, name, _ in parts], [part for *_, part in parts]
+        self._owners, self._names, self._parts = ([*column] for column in zip(*parts, strict=True))
         self._weights = [part for part in self._parts if isinstance(part, Tensor)]
         self._are_tracked = not any(p.is_inference() for p in self._weights)
         self._state = self._state_of_weights()
@@ -105,11 +108,11 @@ class GPEProgramRunner:
 
     def is_current(self) -> bool:
         """Tell whether the model still has the layers and weights with which the program was written."""
-        return all(map(is_, [own.get(name) for own, name in self._places], self._parts)) and self._state_of_weights() == self._state
+        return all(map(is_, map(dict.get, self._owners, self._names), self._parts)) and self._state_of_weights() == self._state
 
     def _state_of_weights(self) -> tuple[list[int], list[int]]:
         """Return addresses of the weights and PyTorch's counts of their changes. Weights that were made in inference mode have no such count."""
-        return [p.data_ptr() for p in self._weights], [p._version for p in self._weights] if self._are_tracked else []
+        return [*map(Tensor.data_ptr, self._weights)], [*map(_changes, self._weights)] if self._are_tracked else []
 
     def __call__(self, data: HeteroData, skips: Skips, keep_absent: bool) -> Decoded | None:
         """Return what the network decodes from a graph with standardised features; None if the program cannot be used.
@@ -135,34 +138,37 @@ class GPEProgramRunner:
         return found
 
     def _run(self, data: HeteroData, skips: Skips) -> Decoded:
-        kept: list[Tensor] = []  # tensors stay alive while their addresses are in use
+        kept: list[Tensor] = []  # copies stay alive while their addresses are in use
 
         def address(tensor: Tensor, dtype: torch.dtype, *shape: int) -> int:
-            if tensor.dtype is not dtype or tensor.device.type != "cpu" or tensor.shape != shape:
+            if tensor.dtype is not dtype or not tensor.is_cpu or tensor.shape != shape:
                 raise _UnexpectedError
-            kept.append(tensor.contiguous())
-            return kept[-1].data_ptr()
+            if not tensor.is_contiguous():
+                tensor = tensor.contiguous()
+                kept.append(tensor)
+            return tensor.data_ptr()
 
         written, spec, dtype = self.written, self.spec, self.dtype
+        at_nodes, at_edges = contents(data)
         num_nodes, size = [0] * len(self.every), np.zeros(written.program.num_sets, np.int64)
         nodes, edges, results = [], [], []
         count, first = dict[str, int](), dict[str, int]()
         for t, number in self.type_of.items():
-            x = data[t].x
+            x = at_nodes[t]["x"]
             count[t], first[t] = len(x), num_nodes[number]
             num_nodes[number] += count[t]
             nodes.append((address(x, dtype, count[t], spec.node_channels[t]), count[t], first[t]))
-        nodes += [(address(data[m].material_params, dtype, count[m], spec.param_channels[m]), count[m], 0) for m in written.params]
-        nodes += [(address(data[m].mass, dtype, count[m]), count[m], 0) for m in written.mass]
+        nodes += [(address(at_nodes[m]["material_params"], dtype, count[m], spec.param_channels[m]), count[m], 0) for m in written.params]
+        nodes += [(address(at_nodes[m]["mass"], dtype, count[m]), count[m], 0) for m in written.mass]
         for r, rows in self.set_of.items():
-            index, odd, even = data[r].edge_index, data[r].odd, data[r].even
+            index, odd, even = map(at_edges[r].__getitem__, ("edge_index", "odd", "even"))
             n = index.shape[-1]
             size[rows] += n
             features = address(odd, dtype, n, spec.odd_channels[r]), address(even, dtype, n, spec.even_channels[r])
             edges.append((address(index, torch.int64, 2, n), *features, n, first[r[0]], first[r[2]]))
         size[self.every] = num_nodes
         size[written.stress_rows] = not skips.stress
-        bodies = [(address(data[m].body, torch.int64, count[m]), count[m], 0) for m in self.bodies]
+        bodies = [(address(at_nodes[m]["body"], torch.int64, count[m]), count[m], 0) for m in self.bodies]
         found = Decoded({}, {}, {})
         for m, name, _ in self.outputs:
             if name == "stress" and skips.stress:

@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
 from gpe_pl.errors import GpeError
-from gpe_pl.nn.elastic_motion import Cells, Constants, Corners, Walls, cauchy_stress, elastic_motion
+from gpe_pl.nn.elastic_bodies_kernels import move_bodies
+from gpe_pl.nn.elastic_motion import LOGARITHM_SCALE, MAX_SUBSTEPS, STABLE, Cells, Constants, Corners, Walls, cauchy_stress, elastic_motion
 from gpe_pl.system.compiled import is_wanted
 
 MAX_CACHED = 64
@@ -108,6 +109,8 @@ class ElasticBodies(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         if "ptr" in data[m]:
             raise CellError("PyTorch Geometric's Batch does not renumber cells; join graphs with gpe_pl.graphs.batching.batched")
+        if is_wanted() and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
+            return self._moved_at_once(m, data, acceleration, params, mass, with_stress)
         own = data[m].body_pos.new_empty(len(mass), 0) if params is None else params.to(data[m].body_pos.dtype)
         constants = cast(Constants, self.constants[m])(own)
         # an H200 needs 0.1 to 0.4 s to start the operations of all substeps one by one; the compiled pass on the host takes 1 ms with both copies
@@ -133,6 +136,33 @@ class ElasticBodies(nn.Module):
         if with_stress:
             stress = (cauchy_stress(body_pos + way, law, cells) / self.stress_unit.to(device)).to(acceleration)
         return ((way - mean - gravity) / unit).to(acceleration), at_end.to(mass.device), stress
+
+    def _moved_at_once(
+        self, m: str, data: HeteroData, acceleration: Tensor, params: Tensor | None, mass: Tensor, with_stress: bool
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return the results of ``_moved`` by one compiled call on the host."""
+        store = data[m]
+        host = {key: store[key].cpu() for key in ENTRIES}
+        mass_on_host, scene = mass.cpu(), store.batch.cpu() if "batch" in store else None
+        cells = _cells_at_rest(m, host["cell_index"], host["rest_pos"], mass_on_host, scene)
+        law = cast(Constants, self.constants[m]).logarithm
+        units = [self.acceleration_unit, self.spacing, self.stress_unit, self.log_friction[m].exp(), self.wall_distance[m] * self.spacing]
+        moved, at_end = np.empty(acceleration.shape, _array(acceleration).dtype), np.empty(acceleration.shape)
+        components = 4 if self.dim == 2 else 6
+        stress = np.empty((len(mass) if with_stress else 0, components), moved.dtype)
+        own = mass.new_empty(len(mass), 0) if params is None else params
+        entries = (host[key] for key in ("body_pos", "velocity", "wall", "corner_index", "corner"))
+        move_bodies(
+            _array(own), _array(law["weight"]), _array(law["bias"]), LOGARITHM_SCALE, _array(acceleration), _array(data.gravity),
+            _array(mass_on_host), *map(_array, entries), *cells.arrays, np.array([float(x) for x in units]),
+            (float(MAX_SUBSTEPS), STABLE), moved, at_end, stress,
+        )  # fmt: skip
+        found, velocity, tensions = (torch.from_numpy(a).to(mass.device) for a in (moved, at_end, stress))
+        return found, velocity, tensions if with_stress else None
+
+
+def _array(x: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(x.detach().cpu().numpy())
 
 
 def _cells_at_rest(material: str, cell_index: Tensor, rest_pos: Tensor, mass: Tensor, scene: Tensor | None) -> Cells:

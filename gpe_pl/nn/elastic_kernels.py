@@ -203,8 +203,10 @@ def move_forward(
     - ``contacts`` [substep, pair, 6]: normal, place on the edge, fraction of the tangential velocity that friction stops, and the weights of both ends, as
       ``_stop_at_corner`` writes them.
     - ``last_vel`` [node, dim]: velocities at the end of the frame.
+
+    Arrays with fewer rows than substeps are written again from the first row on; two rows are the fewest.
     """
-    dim = pos.shape[1]
+    dim, kept = pos.shape[1], path.shape[0]
     force = np.empty_like(pos)
     for n in range(pos.shape[0]):
         for i in range(dim):
@@ -212,7 +214,8 @@ def move_forward(
     for s in range(number.shape[0]):
         h = 1.0 / number[s]
         for k in range(number[s] + 1):
-            y, velocity = path[k], speed_path[k]
+            here, ahead, now = k % kept, (k + 1) % kept, k % pushed.shape[0]
+            y, velocity = path[here], speed_path[here]
             force[node_start[s] : node_start[s + 1]] = 0.0
             if dim == 2:
                 _add_plane_forces(y, velocity, lam, mu, eta, nodes, gradient, volume, cell_start[s], cell_start[s + 1], force)
@@ -228,25 +231,25 @@ def move_forward(
                 along, distance, has_wall = 0.0, gap[n], False
                 for i in range(dim):
                     value = velocity[n, i] + weight * (force[n, i] / mass[n] + forcing[n, i])
-                    pushed[k, n, i] = value
-                    speed_path[k + 1, n, i] = value
+                    pushed[now, n, i] = value
+                    speed_path[ahead, n, i] = value
                     along += value * normal[n, i]
                     distance += (y[n, i] - pos[n, i]) * normal[n, i]
                     has_wall |= normal[n, i] != 0.0
                 if has_wall and distance + h * along < 0.0:
                     square, change = 0.0, -distance / h - along
                     for i in range(dim):
-                        square += (pushed[k, n, i] - along * normal[n, i]) ** 2
+                        square += (pushed[now, n, i] - along * normal[n, i]) ** 2
                     left = 0.0
                     if square > (friction[n] * change) ** 2:
                         left = 1.0 - friction[n] * change / math.sqrt(square)
                     for i in range(dim):
-                        speed_path[k + 1, n, i] = left * (pushed[k, n, i] - along * normal[n, i]) - distance / h * normal[n, i]
+                        speed_path[ahead, n, i] = left * (pushed[now, n, i] - along * normal[n, i]) - distance / h * normal[n, i]
             for pq in range(pair_start[s], pair_start[s + 1]):
-                _stop_at_corner(y, speed_path[k + 1], mass, point[pq], point_friction[pq], pair[pq, 0], pair[pq, 1], h, contacts[k, pq])
+                _stop_at_corner(y, speed_path[ahead], mass, point[pq], point_friction[pq], pair[pq, 0], pair[pq, 1], h, contacts[now, pq])
             for n in range(node_start[s], node_start[s + 1]):
                 for i in range(dim):
-                    path[k + 1, n, i] = y[n, i] + h * speed_path[k + 1, n, i]
+                    path[ahead, n, i] = y[n, i] + h * speed_path[ahead, n, i]
 
 
 @njit(cache=True, error_model="numpy")

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,6 +95,12 @@ class Cells:
     def to(self, device: torch.device) -> Cells:
         """Return the same cells on a device."""
         return self if self.nodes.device == device else Cells(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+    @cached_property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """Nodes, gradients, volumes and rates of the cells, and the first cell and node of each scene, as contiguous arrays."""
+        nodes, gradient, volume, rate, scene, node_start = (np.ascontiguousarray(getattr(self, f.name).numpy()) for f in fields(self))
+        return nodes, gradient, volume, rate, np.searchsorted(scene, np.arange(self.num_scenes + 1)), node_start
 
     @property
     def num_scenes(self) -> int:
@@ -388,14 +395,12 @@ class _Motion(torch.autograd.Function):
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
         *values, pair, cells, number = inputs
         values = [t.detach().contiguous() for t in values]
-        pos, arrays, scene = values[0], [t.numpy() for t in values], cells.scene.numpy()
-        nodes = np.ascontiguousarray(cells.nodes.numpy())
-        cell_start = np.searchsorted(scene, np.arange(cells.num_scenes + 1))
-        node_start, most = cells.node_start.numpy(), int(number.max())
+        pos, arrays, most = values[0], [t.numpy() for t in values], int(number.max())
+        nodes, gradient, volume, _, cell_start, node_start = cells.arrays
         path, speed_path, pushed = np.empty((most + 1, *pos.shape)), np.empty((most + 1, *pos.shape)), np.empty((most, *pos.shape))
         pairs = np.ascontiguousarray(pair.numpy())
         pair_start = np.searchsorted(np.searchsorted(node_start, pairs[:, 0], side="right") - 1, np.arange(cells.num_scenes + 1))
-        geometry = (pairs, nodes, cells.gradient.numpy(), cells.volume.numpy(), cell_start, node_start, pair_start, number.numpy())
+        geometry = (pairs, nodes, gradient, volume, cell_start, node_start, pair_start, number.numpy())
         contacts = np.zeros((most, len(pairs), 6))
         last_vel = np.empty_like(arrays[0])
         move_forward(*arrays, *geometry, path, speed_path, pushed, contacts, last_vel)

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gpe_pl.nn.fused import works_on
-from gpe_pl.nn.island_momentum_kernels import remove_rigid_part
+from gpe_pl.nn.island_momentum_kernels import remove_rigid_part, replace_rigid_part
 
 IslandMomentum = Literal["ignored", "linear", "angular"]
 SMALLEST_PRINCIPAL_FRACTION = 1e-4
@@ -49,7 +49,8 @@ def conserve(
     if _compiles(acceleration, mass, pos):
         kept = acceleration.clone()
         if bool(is_free.any()):
-            _remove(kept, mass, pos, island, is_free, angular)
+            arrays = [t.detach().contiguous().numpy() for t in (mass, pos, island, is_free)]
+            remove_rigid_part(kept.detach().numpy(), *arrays, angular, SMALLEST_PRINCIPAL_FRACTION)
         return kept
     rows = torch.nonzero(is_free[island]).flatten()
     if not len(rows):
@@ -74,23 +75,49 @@ def rigid_part(
         body: body of each node.
         count: number of bodies.
     """
-    if _compiles(acceleration, mass, pos):
-        rest = acceleration.clone()
-        _remove(rest, mass, pos, body, torch.ones(count, dtype=torch.bool), angular=True)
-        return acceleration - rest
     rows = torch.arange(body.shape[0], device=body.device)
     return acceleration - _kept(acceleration, mass, pos, body, rows, count, angular=True)
+
+
+def moved_by_contacts(
+    acceleration: Float[Tensor, "node dim"],
+    forces: Float[Tensor, "node dim"],
+    mass: Float[Tensor, " node"],
+    pos: Float[Tensor, "node dim"],
+    body: Int64[Tensor, " node"],
+    count: int,
+    are_rigid: bool,
+    only_contacts: bool,
+) -> Float[Tensor, "node dim"]:
+    """Return accelerations in which contacts take the place of the rigid part of the accelerations of bodies.
+
+    Args:
+        acceleration: accelerations that a network decodes at nodes.
+        forces: accelerations by contacts.
+        mass: masses.
+        pos: positions.
+        body: body of each node; a negative number stands for none, and the node keeps its acceleration.
+        count: number of bodies, or an upper bound of it.
+        are_rigid: contacts move bodies as a whole. Otherwise they act at the nodes where they are.
+        only_contacts: nodes of bodies have no acceleration besides contacts; for bodies that are not rigid.
+    """
+    if _compiles(acceleration, forces, mass, pos):
+        moved = acceleration.clone()
+        arrays = [t.detach().contiguous().numpy() for t in (forces, mass, pos, body)]
+        replace_rigid_part(moved.detach().numpy(), *arrays, count, are_rigid, only_contacts, SMALLEST_PRINCIPAL_FRACTION)
+        return moved
+    in_body = body >= 0
+    groups = torch.where(in_body, body, count), count + 1
+    if are_rigid:
+        change = rigid_part(forces - acceleration, mass, pos, *groups)
+    else:
+        change = forces - (acceleration if only_contacts else rigid_part(acceleration, mass, pos, *groups))
+    return acceleration + torch.where(in_body[:, None], change, 0.0)
 
 
 def _compiles(*tensors: Tensor) -> bool:
     """Tell whether ``island_momentum_kernels`` can be used in the present context."""
     return not torch.is_grad_enabled() and works_on(*tensors)
-
-
-def _remove(acceleration: Tensor, mass: Tensor, pos: Tensor, group: Tensor, is_wanted: Tensor, angular: bool) -> None:
-    """Remove the rigid part of the accelerations of some groups, in place."""
-    arrays = [t.detach().contiguous().numpy() for t in (mass, pos, group, is_wanted)]
-    remove_rigid_part(acceleration.detach().numpy(), *arrays, angular, SMALLEST_PRINCIPAL_FRACTION)
 
 
 def _kept(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, rows: Tensor, count: int, angular: bool) -> Tensor:

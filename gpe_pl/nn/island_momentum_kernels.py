@@ -59,6 +59,34 @@ def remove_rigid_part(acceleration, mass, pos, group, is_wanted, angular, smalle
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
+def replace_rigid_part(acceleration, forces, mass, pos, body, count, are_rigid, only_contacts, smallest):
+    """Change accelerations as ``island_momentum.moved_by_contacts``, in place."""
+    num_nodes, dim = acceleration.shape
+    group, is_wanted, change = body.copy(), np.ones(count + 1, np.bool_), acceleration.copy()
+    is_wanted[count] = False
+    for n in range(num_nodes):
+        group[n] = body[n] if body[n] >= 0 else count
+        if are_rigid:
+            for d in range(dim):
+                change[n, d] = forces[n, d] - acceleration[n, d]
+    rest = change.copy()
+    if are_rigid or not only_contacts:
+        remove_rigid_part(rest, mass, pos, group, is_wanted, True, smallest)
+    for n in range(num_nodes):
+        if body[n] < 0:
+            continue
+        for d in range(dim):
+            rigid = change[n, d] - rest[n, d]
+            if are_rigid:
+                acceleration[n, d] += rigid
+            elif only_contacts:
+                acceleration[n, d] = forces[n, d]
+            else:
+                acceleration[n, d] += forces[n, d] - rigid
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def _rotations(acceleration, mass, pos, group, is_wanted, mean, centre, smallest, turn):
     """Write the angular acceleration of each group, about its centre of mass, to ``turn`` [group, 3]."""
     num_nodes, dim = acceleration.shape

@@ -15,6 +15,8 @@ from torch_geometric.data import Batch
 from gpe_pl.benchmarks.stability.subject import in_flight
 from gpe_pl.export.program import export_model
 from gpe_pl.geometry.shape_values import moved as moved_shape
+from gpe_pl.geometry.shapes import Box, domain_walls
+from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.approximate import Repeating, Sleeping
@@ -26,7 +28,9 @@ from gpe_pl.rollout.containment import contain
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import node_code
+from gpe_pl.system.compiled import unfused
 from gpe_pl.training.push_forward import MOVED, _moved
+from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.reflection import Reflection
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import read_trajectory, write_shard
@@ -83,6 +87,44 @@ def test_scenes_of_a_batch_move_as_alone(kind: str) -> None:
         assert isinstance(after, State) and after.frame_velocity is not None
         assert_close((after.pos, after.frame_velocity), step(simulated, state))
     assert not torch.allclose(simulated.step(states[0]).pos, states[0].pos + DT * states[0].vel, atol=1e-3 * scenes.SPACING)
+
+
+class DoubleBuilder(GraphBuilder):
+    """Builder of graphs in double precision."""
+
+    precision = torch.float64
+
+
+def beside_an_obstacle(seed: int, kind: str, num_bodies: int) -> State:
+    """Return strained bodies with a box at one of them, whose corner is near their edges."""
+    state = scenes.mesh_state(kind, ("solid",), seed=seed, num_bodies=num_bodies)
+    corner, dim = state.pos[0], state.pos.shape[1]
+    box = Box(tuple(corner - 3.2 * scenes.SPACING), tuple(corner - 0.2 * scenes.SPACING), 0.4)
+    boundary = Boundary.sample((*domain_walls(((-1.0, 2.0),) * dim, 0.3), box), scenes.SPACING, dim)
+    return replace(state, boundary=boundary, velocity_history=state.vel[:, None]).to_torch()
+
+
+@pytest.mark.parametrize("kind", ["triangles", "lattice", "tetrahedra"])
+@pytest.mark.parametrize(("is_double", "tolerance"), [(True, 1e-10), (False, 1e-5)])
+@pytest.mark.parametrize("stiffness", [0.0, 2.0])  # cells with the second are softened
+def test_the_compiled_motion_equals_the_plain_one(kind: str, is_double: bool, tolerance: float, stiffness: float) -> None:
+    simulated = simulator(("solid",), 3 if kind == "tetrahedra" else 2, stress=True)
+    build, model = simulated.builder, simulated.model
+    if is_double:
+        build, model = DoubleBuilder(build.config, build.metadata), model.double()
+    with torch.no_grad():
+        model.get_parameter("elastic_bodies.constants.solid.logarithm.bias").add_(stiffness)
+    graph = batched([build(beside_an_obstacle(seed, kind, count)) for seed, count in ((0, 1), (1, 2), (2, 1))])
+    store = graph["solid"]
+    assert kind == "tetrahedra" or len(store.corner)
+    forces = {"solid": torch.randn(store.pos.shape, generator=torch.Generator().manual_seed(0)).to(build.precision)}
+    inputs = graph, forces, {"solid": store.material_params.to(build.precision)}, {"solid": store.mass}, True
+    with torch.no_grad():
+        found = model.elastic_bodies(*inputs)
+        with unfused():
+            expected = model.elastic_bodies(*inputs)
+    for value, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(value["solid"], other["solid"], rtol=0, atol=tolerance * float(other["solid"].abs().max()))
 
 
 def test_scenes_with_and_without_cells_move_as_alone() -> None:

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from gpe_pl.nn.island_momentum import conserve, rigid_part
+from gpe_pl.nn.island_momentum import conserve, moved_by_contacts, rigid_part
+from gpe_pl.system.compiled import unfused
 
 SIZES = (40, 1, 2, 25, 3)
 FREE = torch.tensor([True, True, True, False, True])
@@ -96,6 +97,25 @@ def test_the_rigid_part_of_each_body_is_the_nearest_rigid_motion(dim: int) -> No
         fit = torch.linalg.lstsq(weight * motions, weight * a[rows].reshape(-1, 1), driver="gelsd").solution
         torch.testing.assert_close(part[rows].reshape(-1, 1), motions @ fit)
     torch.testing.assert_close(rigid_part(part, mass, pos, body, len(SIZES)), part)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("modes", [(True, False), (False, False), (False, True)], ids=["rigid", "local", "only contacts"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+def test_compiled_contacts_move_bodies_as_plain_operations_do(
+    dim: int, modes: tuple[bool, bool], dtype: torch.dtype, tolerance: float
+) -> None:
+    a, mass, pos, body = scene(dim)
+    forces = torch.randn(a.shape, generator=torch.Generator().manual_seed(1), dtype=a.dtype)
+    body = torch.where(body == 4, -1, body)
+    inputs = *(t.to(dtype) for t in (a, forces, mass, pos)), body, len(SIZES) - 1, *modes
+    with torch.no_grad():
+        found = moved_by_contacts(*inputs)
+        with unfused():
+            expected = moved_by_contacts(*inputs)
+    torch.testing.assert_close(found, expected, rtol=0, atol=tolerance * float(expected.abs().max()))
+    assert torch.equal(found[body < 0], a.to(dtype)[body < 0])
+    assert (found - a.to(dtype))[body >= 0].abs().min() > 0
 
 
 def rigid_motions(pos: Tensor) -> Tensor:

@@ -1,0 +1,179 @@
+"""The motion of elastic bodies over a frame in one compiled call, for rollouts on a CPU: what ``elastic_bodies`` computes with PyTorch's operations.
+
+It keeps no substeps for a backward pass. Sums and constants are in double precision.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+from gpe_pl.nn.elastic_kernels import LOG_SMALLEST, move_forward
+from gpe_pl.trajectory.strain import SMALLEST_RATIO
+
+KEPT = 2
+"""Number of substeps in memory."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def move_bodies(
+    params, weight, bias, scale, acceleration, gravity, mass, body_pos, velocity, wall, corner_index, corner, nodes, gradient, volume, rate, cell_start,
+    node_start, units, limits, moved, at_end, stress,
+):  # fmt: skip
+    """Compute the motion of the bodies of one material in all scenes of a graph.
+
+    Args:
+        params: standardised material parameters [node, param].
+        weight, bias: affine map of the parameters to the logarithms of λ, μ and η [3, param] and [3], in units of ``scale``.
+        scale: factor of the logarithms.
+        acceleration: accelerations without gravity by all but cells and walls [node, dim].
+        gravity: gravity of each scene [scene, dim] in m/frame².
+        mass: masses [node].
+        body_pos, velocity, wall, corner_index, corner: entries of the graph, see ``graphs.builder``.
+        nodes, gradient, volume, rate: of cells, see ``elastic_motion.Cells``.
+        cell_start, node_start: first cell and node of each scene, and their numbers [scene + 1].
+        units: units of accelerations, of length, and of stresses, factor of the friction, and distance in m at which walls act.
+        limits: largest number of substeps, and length of a substep as a fraction of the largest one that is stable.
+        moved: accelerations without gravity that move the nodes as far [node, dim]; a result.
+        at_end: velocities at the end of the frame [node, dim] in m/frame; a result.
+        stress: Cauchy stress at the end of the frame [node, component], or without rows; a result.
+    """
+    num_nodes, dim = acceleration.shape
+    acceleration_unit, spacing, stress_unit, friction_factor, wall_distance = units
+    pos, vel, forcing, weights = np.empty((num_nodes, dim)), np.empty((num_nodes, dim)), np.empty((num_nodes, dim)), np.empty(num_nodes)
+    normal, gap, friction = np.empty((num_nodes, dim)), np.empty(num_nodes), np.empty(num_nodes)
+    for s in range(len(node_start) - 1):
+        for n in range(node_start[s], node_start[s + 1]):
+            weights[n] = mass[n]
+            gap[n], friction[n] = max(wall[n, dim] - wall_distance, 0.0), wall[n, dim + 1] * friction_factor
+            for a in range(dim):
+                pos[n, a], vel[n, a], normal[n, a] = body_pos[n, a], velocity[n, dim + a], wall[n, a]
+                forcing[n, a] = acceleration[n, a] * acceleration_unit + gravity[s, a]
+    point, point_friction = np.empty((len(corner), dim)), np.empty(len(corner))
+    for k in range(len(corner)):
+        point_friction[k] = corner[k, dim] * friction_factor
+        for a in range(dim):
+            point[k, a] = pos[corner_index[k, 0], a] + corner[k, a]
+    lam, mu, eta = _constants(params, weight, bias, scale, spacing ** (2 - dim), nodes)
+    number = np.empty(len(node_start) - 1, np.int64)
+    for s in range(len(number)):
+        number[s] = _soften(pos, lam, mu, eta, nodes, gradient, rate, cell_start[s], cell_start[s + 1], limits[0], limits[1])
+    pair_start, scene = np.zeros(len(node_start), np.int64), 0
+    for k in range(len(corner)):
+        while corner_index[k, 0] >= node_start[scene + 1]:
+            scene += 1
+            pair_start[scene] = k
+    pair_start[scene + 1 :] = len(corner)
+    path, speed_path, pushed = np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim))
+    contacts = np.zeros((KEPT, len(corner), 6))
+    move_forward(
+        pos, vel, forcing, weights, lam, mu, eta, normal, gap, friction, point, point_friction, corner_index, nodes, gradient, volume, cell_start,
+        node_start, pair_start, number, path, speed_path, pushed, contacts, at_end,
+    )  # fmt: skip
+    for s in range(len(number)):
+        last = path[number[s] % KEPT]
+        for n in range(node_start[s], node_start[s + 1]):
+            for a in range(dim):
+                way = last[n, a] - pos[n, a]
+                moved[n, a] = (way - velocity[n, a] - gravity[s, a]) / acceleration_unit
+                pos[n, a] += way
+    if len(stress):
+        _write_stress(pos, lam, mu, nodes, gradient, volume, stress_unit, stress)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _constants(params, weight, bias, scale, modulus, nodes):
+    """Return λ, μ and η of each cell, the means over its corners; see ``elastic_motion.Constants``."""
+    of_node, found = np.empty((len(params), 3)), np.zeros((3, len(nodes)))
+    for n in range(len(params)):
+        for k in range(3):
+            logarithm = float(bias[k])
+            for c in range(params.shape[1]):
+                logarithm += params[n, c] * weight[k, c]
+            of_node[n, k] = math.exp(min(max(scale * logarithm, -20.0), 20.0)) * modulus
+    corners = nodes.shape[1]
+    for cell in range(len(nodes)):
+        for k in range(3):
+            for a in range(corners):
+                found[k, cell] += of_node[nodes[cell, a], k] / corners
+    return found[0], found[1], found[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _deformation(pos, nodes, gradient, cell, q, f):
+    """Write the deformation gradient at a quadrature point to f [3, 3]; return its determinant. In 2D, f is that of plane strain."""
+    dim = pos.shape[1]
+    f[:] = 0.0
+    f[2, 2] = 1.0 if dim == 2 else 0.0
+    for a in range(1, nodes.shape[1]):
+        for i in range(dim):
+            difference = pos[nodes[cell, a], i] - pos[nodes[cell, 0], i]
+            for j in range(dim):
+                f[i, j] += difference * gradient[cell, q, a, j]
+    minor0, minor1 = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1], f[1, 2] * f[2, 0] - f[1, 0] * f[2, 2]
+    return f[0, 0] * minor0 + f[0, 1] * minor1 + f[0, 2] * (f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _soften(pos, lam, mu, eta, nodes, gradient, rate, first, end, most, stable):
+    """Soften cells of a scene that need more than ``most`` substeps, in place, and return the number of substeps; see ``Cells.substeps``."""
+    dim, largest, f = pos.shape[1], 0.0, np.empty((3, 3))
+    for cell in range(first, end):
+        stiffness, damping = -math.inf, -math.inf
+        for q in range(gradient.shape[1]):
+            ratio = max(_deformation(pos, nodes, gradient, cell, q, f), SMALLEST_RATIO)
+            change = (lam[cell] * math.log(ratio) - mu[cell]) / ratio
+            second, square = (lam[cell] / ratio - change) / ratio, 0.0
+            for i in range(dim):
+                for j in range(dim):
+                    square += f[i, j] * f[i, j] / dim
+            bound = max(abs(change) * math.sqrt(square), second * square ** (dim - 1) + abs(change))
+            stiffness, damping = max(stiffness, mu[cell] + bound), max(damping, 2.0 * eta[cell] * square * dim)
+        frequency, damping = max(stiffness, 0.0) * rate[cell], damping * rate[cell]
+        needed = 0.25 * (damping + math.sqrt(damping * damping + 4.0 * frequency)) / stable
+        largest = max(largest, min(needed, most))
+        excess = min(max(needed / most, 1.0), 1e15)
+        lam[cell], mu[cell], eta[cell] = lam[cell] / excess**2, mu[cell] / excess**2, eta[cell] / excess
+    return max(math.ceil(largest - 1e-9), 1)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _write_stress(pos, lam, mu, nodes, gradient, volume, unit, stress):
+    """Write the Cauchy stress at nodes in a unit to ``stress``, see ``elastic_motion.cauchy_stress``."""
+    dim, (num_nodes, components) = pos.shape[1], stress.shape
+    total, whole, f = np.zeros((num_nodes, components)), np.zeros(num_nodes), np.empty((3, 3))
+    rows, columns = (
+        (np.array([0, 0, 1, 2]), np.array([0, 1, 1, 2])) if dim == 2 else (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))
+    )
+    own = np.empty(components)
+    for cell in range(len(nodes)):
+        own[:] = 0.0
+        size = 0.0
+        for q in range(volume.shape[1]):
+            ratio = _deformation(pos, nodes, gradient, cell, q, f)
+            safe = max(ratio, SMALLEST_RATIO)
+            volumetric = lam[cell] * math.log(safe) - mu[cell]
+            if not ratio > SMALLEST_RATIO:
+                volumetric = (lam[cell] * (LOG_SMALLEST + (ratio - SMALLEST_RATIO) / SMALLEST_RATIO) - mu[cell]) * ratio / SMALLEST_RATIO
+            size += volume[cell, q]
+            for k in range(components):
+                i, j, left = rows[k], columns[k], 0.0
+                for m in range(3):
+                    left += f[i, m] * f[j, m]
+                own[k] += volume[cell, q] * (mu[cell] * left + (volumetric if i == j else 0.0)) / safe
+        for a in range(nodes.shape[1]):
+            n = nodes[cell, a]
+            whole[n] += size
+            for k in range(components):
+                total[n, k] += own[k]
+    for n in range(num_nodes):
+        for k in range(components):
+            stress[n, k] = total[n, k] / whole[n] / unit if whole[n] > 0.0 else 0.0
