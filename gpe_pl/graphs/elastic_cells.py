@@ -12,7 +12,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.geometry.compiled_distance import has_compiled_distance
 from gpe_pl.geometry.compiled_surfaces import write_nearest_surfaces
-from gpe_pl.graphs import compiled_cells
+from gpe_pl.graphs import elastic_cells_kernels
 from gpe_pl.graphs.compiled_graph import NO_ROWS, works_on
 from gpe_pl.graphs.contacts import (
     MOST_FRICTION,
@@ -92,10 +92,10 @@ def _entries_in_compiled_loops(
         topology.islands,
     )
     velocity, body_pos = np.empty((num_rows, 2 * dim), dtype), np.zeros((num_rows, dim), dtype)
-    compiled_cells.write_velocities(vel, at_frame, rows, scales.frame_dt, velocity)
+    elastic_cells_kernels.write_velocities(vel, at_frame, rows, scales.frame_dt, velocity)
     if mesh is not None and islands is not None and len(at_rest.cell_index):
         shift = NO_ROWS if mesh.shift is None else as_array(mesh.shift)
-        compiled_cells.write_from_centre(pos, shift, rows, islands.body[material].numpy(), islands.num_bodies, body_pos)
+        elastic_cells_kernels.write_from_centre(pos, shift, rows, islands.body[material].numpy(), islands.num_bodies, body_pos)
     if boundary.shapes and has_compiled_distance(boundary.shapes):
         is_near, wall = np.zeros(num_rows, np.bool_), np.empty((num_rows, dim + 2), dtype)
         touching = topology.edges.get((BOUNDARY, RADIUS, material))
@@ -108,7 +108,7 @@ def _entries_in_compiled_loops(
     ends, corner = np.empty((0, 2), np.int64), np.empty((0, dim + 1), dtype)
     if len(at_rest.surface) and not topology.periodicity:
         corners, points = convex_corners(boundary, scales.spacing), as_array(boundary.pos)
-        pairs = compiled_cells.near_corners(pos, rows, at_rest.surface, points, corners, scales.radius**2)
+        pairs = elastic_cells_kernels.near_corners(pos, rows, at_rest.surface, points, corners, scales.radius**2)
         if len(pairs):
             ends = at_rest.surface[pairs[:, 0]]
             corner = beside_first_node(pos[rows[ends[:, 0]]], boundary, corners[pairs[:, 1]]).astype(dtype)
