@@ -77,6 +77,25 @@ def _put_back(vel, dt, kinds, starts, numbers, tolerance, inside, new_pos, new_v
             new_pos[n, a] = x[a]
 
 
+def are_near(shapes: tuple[Any, ...], start: np.ndarray, end: np.ndarray, farthest: float, deepest: float) -> bool:
+    """Tell whether all points moved at most ``farthest`` [m] from start to end [point, dim], and ended at most ``deepest`` [m] deep in shapes."""
+    packed = packed_shapes(shapes)
+    found: bool = _are_near(start, end, packed.kinds, packed.starts, packed.numbers, farthest * farthest, deepest)
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _are_near(start, end, kinds, starts, numbers, square, deepest):
+    for n in range(end.shape[0]):
+        moved = 0.0
+        for a in range(end.shape[1]):
+            moved += (end[n, a] - start[n, a]) ** 2
+        if not (moved <= square and -nearest_of(end[n], kinds, starts, numbers) <= deepest):
+            return False
+    return True
+
+
 def write_nearest_surfaces(
     shapes: tuple[Any, ...], pos: np.ndarray, rows: np.ndarray, is_near: np.ndarray, step: float, most_friction: float, found: np.ndarray
 ) -> None:

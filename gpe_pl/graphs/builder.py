@@ -35,7 +35,7 @@ from gpe_pl.graphs.features import (
     scales_of,
     virtual_features,
 )
-from gpe_pl.graphs.neighbors import Points, check_crowding
+from gpe_pl.graphs.neighbors import Points, are_below, check_crowding
 from gpe_pl.graphs.search import as_array, find_topology, rows_of
 from gpe_pl.graphs.standards import Standards, raw
 from gpe_pl.graphs.topology import GraphError as GraphError
@@ -149,7 +149,7 @@ class GraphBuilder:
                 "make the state with initial_state of the simulator"
             )
         pos, motion = as_array(state.pos), as_array(history)
-        if not ((np.abs(pos) < LARGEST).all() and (np.abs(motion) < LARGEST).all()):
+        if not (are_below(pos.ravel(), LARGEST) and are_below(motion.ravel(), LARGEST)):
             values = np.concatenate([pos, motion.reshape(len(pos), -1)], axis=1)
             node = int(np.argmin((np.abs(values) < LARGEST).all(axis=1)))
             what, reason = ("beyond all measure", "explosion") if np.isfinite(values[node]).all() else ("not finite", "nan")

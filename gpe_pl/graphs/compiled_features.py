@@ -42,6 +42,21 @@ def motion(history, rows, gravity, level, velocity_unit, acceleration_unit, mean
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
+def write_arms(pos, label, num_islands, arm):
+    """Write positions relative to the mean of their island to ``arm`` [node, dim]."""
+    num_nodes, dim = pos.shape
+    count, centre = np.zeros(num_islands), np.zeros((num_islands, dim))
+    for n in range(num_nodes):
+        count[label[n]] += 1.0
+        for a in range(dim):
+            centre[label[n], a] += pos[n, a]
+    for n in range(num_nodes):
+        for a in range(dim):
+            arm[n, a] = pos[n, a] - centre[label[n], a] / count[label[n]]
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
 def walls(vel, normal, friction, restitution, rows, with_condition, velocity_unit, mean, inverse, out):
     """Write ``features.boundary_features`` of boundary nodes to ``out`` [row, channel].
 

@@ -162,15 +162,13 @@ class CompiledGraph:
 
     def _add_islands(self, stores: dict[str, dict[str, Any]], islands: IslandTopology, rows: dict[str, Tensor], pos: np.ndarray) -> None:
         label = islands.label.numpy()
+        arm = self._new(*pos.shape)
         if islands.arm is None:
-            count = np.bincount(label, minlength=len(islands.is_free))
-            centre = np.stack([np.bincount(label, x, len(islands.is_free)) / count for x in pos.T], axis=1)
-            arm = pos - centre[label]
+            compiled_features.write_arms(pos, label, len(islands.is_free), arm)
         else:
-            arm = islands.arm.numpy()
-        arm = arm.astype(self.precision)
+            arm[:] = islands.arm.numpy()
         for material, r in rows.items():
-            own = r.numpy()
+            own = r.numpy() if len(rows) > 1 else slice(None)  # the only material has all nodes
             stores[material] |= {"pos": torch.from_numpy(arm[own]), "island": torch.from_numpy(label[own])}
         for material, body in islands.body.items():
             stores[material]["body"] = body

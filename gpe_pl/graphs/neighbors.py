@@ -9,9 +9,11 @@ period.
 from __future__ import annotations
 
 from functools import cached_property
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from numba import njit
 from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
@@ -63,6 +65,16 @@ class Points:
         cells = np.where(around[: x.shape[1]] > 0, np.minimum(cells, around[: x.shape[1]] - 1), cells)
         place[np.lexsort(cells.T[::-1])] = np.arange(len(self))
         return place
+
+
+@njit(cache=True)
+@no_type_check
+def are_below(values, largest):
+    """Tell whether the magnitudes of all values [value] are below ``largest``; NaN is not."""
+    found = True
+    for k in range(values.shape[0]):
+        found &= abs(values[k]) < largest
+    return found
 
 
 def pairs_at_rest(num_nodes: int, radius: float, spacing: float, dim: int) -> float:

@@ -11,6 +11,8 @@ import numpy as np
 from array_api_compat import array_namespace
 from numba import njit
 
+from gpe_pl.geometry.compiled_distance import has_compiled_distance
+from gpe_pl.geometry.compiled_surfaces import are_near
 from gpe_pl.geometry.shape_values import shapes_fault
 from gpe_pl.geometry.shapes import Shape, signed_distance
 from gpe_pl.schema import NODE_TYPES
@@ -130,7 +132,7 @@ class Guard:
     def _tunnelling(self, before: State | None, state: State, frame: int) -> Termination | None:
         """Find nodes deeper than ``margin`` in a wall or obstacle, and nodes that passed through one: outside in both frames, but inside on the way."""
         shapes, end = state.boundary.shapes, as_numpy(state.pos)
-        if not shapes:
+        if not shapes or self._is_far_from_tunnelling(before, state):
             return None
         distance = signed_distance(shapes, end)
         node = int(np.argmin(distance))
@@ -157,6 +159,16 @@ class Guard:
             return None
         text = f"frame {frame}: node {node} went {deepest[node]:.3g} m deep through a wall or obstacle within one frame"
         return Termination("tunnelling", frame, node, text)
+
+    def _is_far_from_tunnelling(self, before: State | None, state: State) -> bool:
+        """Tell in one compiled pass whether no node can have tunnelled: none is deep in a shape, and none has moved farther than through a thin wall."""
+        shapes = state.boundary.shapes
+        if state.periodicity or not has_compiled_distance(shapes):
+            return False
+        pos = np.ascontiguousarray(as_numpy(state.pos), np.float64)
+        start = pos if before is None else np.ascontiguousarray(as_numpy(before.pos), np.float64)
+        deepest = self.margin if self.margin > 0 else math.inf
+        return are_near(shapes, start, pos, 2 * TUNNEL_DEPTH * self.spacing, deepest)
 
     def of(self, start: State) -> Guard:
         """Return the guard for a rollout from a state, which may be denser than usual.
