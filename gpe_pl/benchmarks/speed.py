@@ -10,11 +10,13 @@ the time for moving every edge state in and out of memory once per layer.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 import torch
@@ -23,14 +25,17 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 from torch_geometric.data import HeteroData
 
+from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
 from gpe_pl.benchmarks.step_ratio import step_records, step_table
 from gpe_pl.benchmarks.trained import Case as Trained
+from gpe_pl.benchmarks.trained import fingerprint_of
 from gpe_pl.benchmarks.training_step_ratio import training_records, training_table
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.files.markdown import table_row
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.lattice import lattice_graph, lattice_scene
 from gpe_pl.graphs.neighbors import radius_pairs
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.base import Model
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
@@ -39,7 +44,7 @@ from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.fused import unfused
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction
 from gpe_pl.schema import FeatureSpec
-from gpe_pl.system.machine import copy_rate, gemm_rate, has_cpp_compiler, peak_memory, peak_on_gpu, reduces_precision, synchronized
+from gpe_pl.system.machine import copy_rate, gemm_rate, has_cpp_compiler, peak_on_gpu, peaks_in_turn, reduces_precision, synchronized
 from gpe_pl.system.timing import apart, paired_ratio, paired_times
 from gpe_pl.training.run import TrainingSettings
 
@@ -48,6 +53,12 @@ log = logging.getLogger(__name__)
 INTERACTIONS: tuple[Interaction, ...] = ("directed", "negated", "odd", "odd_even")
 REFERENCE = "directed, plain"
 """Case with which others are compared: the usual message passing, which multiplies concatenated features of each directed edge."""
+REFERENCE_CASE: dict[str, Any] = {"interaction": "directed", "implementation": "plain"}
+AT_ONCE = 2
+"""Number of cases that are timed in turns with the reference. Training steps of the three take 7 GB together."""
+Wanted = Literal["forward", "training", "peaks"]
+RESUMES = True
+"""``run`` takes a folder and continues where an earlier run was stopped."""
 TRAINS = True
 """Whether the suite also takes the settings of a training on each data set."""
 SAND = "sand"
@@ -154,11 +165,11 @@ class Case:
 
 def cases(compiled: bool, reduced: bool) -> dict[str, Case]:
     """Return the timed cases by name, the reference first. ``compiled`` adds cases with ``torch.compile``, ``reduced`` cases with less precise products."""
-    found = {f"{i}, plain": Case(interaction=i, implementation="plain") for i in INTERACTIONS}
+    found = {REFERENCE: Case(**REFERENCE_CASE)} | {f"{i}, plain": Case(interaction=i, implementation="plain") for i in INTERACTIONS}
     found |= {f"{i}, factored": Case(interaction=i, is_fused=False) for i in INTERACTIONS}
     found |= {i: Case(interaction=i) for i in ("negated", "odd")}
-    if compiled:
-        found |= {f"{i}, compiled": Case(interaction=i, compiled=True) for i in ("negated", "odd")}
+    if compiled:  # of one case, because compilation takes a minute
+        found |= {"negated, compiled": Case(compiled=True)}
     if reduced:
         found |= {f"directed, plain{MEDIUM}": Case(interaction="directed", implementation="plain", precision="medium")}
         found |= {f"{i}{MEDIUM}": Case(interaction=i, precision="medium") for i in ("negated", "odd")}
@@ -188,22 +199,31 @@ def edge_bytes(case: Case, spec: FeatureSpec, graph: HeteroData, settings: Setti
     return 4 * edges * settings.hidden_channels * 2 * settings.num_message_passing_steps
 
 
-def forward_pass(case: Case, settings: Settings) -> Callable[[], Any]:
-    """Return a forward pass in inference, with graph and model already built."""
-    model, graph = _built(case, settings)
-    return synchronized(case.runs(torch.inference_mode()(lambda: model(graph))), settings.device)
+class Passes:
+    """Forward passes in evaluation mode, and training steps, of a case. Graph and model are made once.
 
+    Args:
+        case: the case.
+        settings: size of the graph and of the model.
+    """
 
-def training_pass(case: Case, settings: Settings) -> Callable[[], Any]:
-    """Return a training step, with graph and model already built."""
-    return synchronized(case.runs(training_step(*_built(case, settings))), settings.device)
+    def __init__(self, case: Case, settings: Settings) -> None:
+        torch.set_num_threads(settings.num_threads)
+        builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
+        model = case.build(builder.spec, settings.num_message_passing_steps, settings.hidden_channels, settings.seed).to(settings.device)
+        model = _compiled(model, settings.device) if case.compiled else model
+        graph = graph.to(settings.device)
+        self.model, self.device = model, settings.device
+        self.forward = synchronized(case.runs(torch.inference_mode()(lambda: model.eval()(graph))), self.device)
+        self.train = synchronized(case.runs(training_step(model, graph)), self.device)
 
-
-def _built(case: Case, settings: Settings) -> tuple[Model, HeteroData]:
-    torch.set_num_threads(settings.num_threads)
-    builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
-    model = case.build(builder.spec, settings.num_message_passing_steps, settings.hidden_channels, settings.seed).to(settings.device)
-    return _compiled(model, settings.device) if case.compiled else model, graph.to(settings.device)
+    def __call__(self, wanted: Wanted) -> dict[str, int] | None:
+        """Run a pass; or return the memory [B] that each needs beyond weights and graph, in a process that has run none."""
+        if wanted == "peaks":
+            passes = {"peak_memory": self.forward, "training_peak_memory": self.train}
+            return peaks_in_turn(passes) if self.device == "cpu" else {name: peak_on_gpu(function) for name, function in passes.items()}
+        (self.forward if wanted == "forward" else self.train)()
+        return None
 
 
 def training_step(model: Model, graph: HeteroData) -> Callable[[], Any]:
@@ -211,6 +231,7 @@ def training_step(model: Model, graph: HeteroData) -> Callable[[], Any]:
     optimizer = torch.optim.Adam(model.parameters(), lr=0.0, fused=True)
 
     def step() -> Tensor:
+        model.train()
         optimizer.zero_grad()
         loss = model(graph).acceleration[SAND].square().mean()
         loss.backward()
@@ -227,77 +248,116 @@ def _compiled(model: Model, device: str) -> Model:
     return model
 
 
-def run(settings: Settings, specs: dict[str, DatasetSpec], trainings: dict[str, TrainingSettings]) -> tuple[list[dict[str, Any]], str]:
-    """Return records of times [s], paired ratios, floors and memory, and a Markdown table."""
+def run(
+    settings: Settings, specs: dict[str, DatasetSpec], trainings: dict[str, TrainingSettings], folder: Path
+) -> tuple[list[dict[str, Any]], str]:
+    """Return records of times [s], paired ratios, floors and memory, and a Markdown table.
+
+    Finished parts are stored in ``folder``: groups of cases, and each shipped model.
+    """
     torch.set_num_threads(settings.num_threads)
-    device = settings.device
-    builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
-    spec, size = builder.spec, (settings.num_message_passing_steps, settings.hidden_channels, settings.seed)
-    num_edges = sum(graph[r].edge_index.shape[1] for r in spec.relations)
+    device, parts = settings.device, FinishedParts(folder / PARTS)
     compiles = settings.compile and (device != "cpu" or has_cpp_compiler())
     if settings.compile and not compiles:
         log.warning("suite.compile: found no C++ compiler, so the cases with torch.compile are left out")
     todo = cases(compiles, reduces_precision(device))
-    forward = _beside_the_reference(forward_pass, todo, settings, settings.num_rounds, "forward passes")
-    training = _beside_the_reference(training_pass, todo, settings, max(1, settings.num_rounds // 2), "training steps")
+    names, measured = [name for name in todo if name != REFERENCE], list[dict[str, Any]]()
+    for first in range(0, len(names), AT_ONCE):
+        group = names[first : first + AT_ONCE]
+        identity = {"settings": asdict(settings), "cases": {name: asdict(todo[name]) for name in group}}
+        measured += _measured(parts, identity, ", ".join(group), partial(_beside_the_reference, {n: todo[n] for n in group}, settings))
+    of_case: dict[str, dict[str, float]] = {}
+    for record in measured:
+        of_case.setdefault(record["case"], {}).setdefault(record["metric"], record["value"])  # the reference is in every group
 
-    gemm, copy = gemm_rate(num_edges, settings.hidden_channels, device), copy_rate(device)
-    records: list[dict[str, Any]] = [
-        {"metric": "gemm_rate", "case": device, "value": gemm, "unit": "FLOP/s"},
-        {"metric": "copy_rate", "case": device, "value": copy, "unit": "B/s"},
-    ]
-    for name, case in todo.items():
-        values: dict[str, tuple[float, str]] = {
-            "forward_time": (forward[name].seconds, "s"),
-            "training_time": (training[name].seconds, "s"),
-            "forward_speedup": (1 / forward[name].ratio, "1"),
-            "forward_speedup_vs_gns": (forward["GNS"].ratio / forward[name].ratio, "1"),
-            "training_speedup": (1 / training[name].ratio, "1"),
-        }
-        if case.precision != "highest":
-            found, expected = (forward_pass(todo[n], settings)().acceleration[SAND] for n in (name, name.removesuffix(MEDIUM)))
-            values["forward_difference"] = (float((found - expected).norm() / expected.norm()), "1")
-        elif case.model == "GPE":
-            if case.saves_against is not None:
-                values["forward_time_saved"] = (1 - forward[name].ratio / forward[case.saves_against].ratio, "1")
-            values["flop"] = (flop(case.build(spec, *size), graph), "FLOP")
-            values["flop_floor"] = (values["flop"][0] / gemm, "s")
-            values["byte_floor"] = (edge_bytes(case, spec, graph, settings) / copy, "s")
-            values["floor_ratio"] = (values["forward_time"][0] / values["flop_floor"][0], "1")
-        if device != "cpu":
-            values["peak_memory"] = (peak_on_gpu(forward_pass(case, settings)), "B")
-            values["training_peak_memory"] = (peak_on_gpu(training_pass(case, settings)), "B")
-        elif not case.compiled and case.precision == "highest":
-            values["peak_memory"] = (peak_memory(forward_pass, case, settings), "B")
-            values["training_peak_memory"] = (peak_memory(training_pass, case, settings), "B")
-        records += [{"metric": metric, "case": name, "value": value, "unit": unit} for metric, (value, unit) in values.items()]
+    builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
+    num_edges = sum(graph[r].edge_index.shape[1] for r in builder.spec.relations)
+    records = _case_records(settings, {name: todo[name] for name in todo if name in of_case}, of_case, builder.spec, graph)
     records += _graph_records(settings)
-    steps = step_records(specs, STEP_ROUNDS * settings.num_rounds)
-    training_steps = training_records(specs, trainings, settings.num_rounds)
+    steps, training_steps = list[dict[str, Any]](), list[dict[str, Any]]()
+    for name, spec in specs.items():
+        identity = {
+            "num_rounds": settings.num_rounds,
+            "model": fingerprint_of(LearnedSimulator.from_checkpoint(name)),
+            "data": spec.as_dict(),
+        }
+        steps += _measured(parts, identity | {"part": "step"}, name, partial(step_records, {name: spec}, STEP_ROUNDS * settings.num_rounds))
+        training = partial(training_records, {name: spec}, {name: trainings[name]}, settings.num_rounds)
+        training_steps += _measured(parts, identity | {"part": "training", "training": asdict(trainings[name])}, name, training)
+    parts.clear()
     tables = [table(settings, num_edges, records), *([step_table(steps), training_table(training_steps)] if steps else [])]
     return records + steps + training_steps, "\n\n".join(tables)
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Time of a case: the median in ``seconds``, and the median ``ratio`` to the time of the reference in the same round."""
+def _measured(
+    parts: FinishedParts, identity: dict[str, Any], what: str, measure: Callable[[], list[dict[str, Any]]]
+) -> list[dict[str, Any]]:
+    """Return the records of a part: those of a stopped suite, or new ones."""
+    if (stored := parts.get(identity)) is not None:
+        return stored
+    started = time.perf_counter()
+    records = measure()
+    log.info("measured %s in %.0f s", what, time.perf_counter() - started)
+    parts.put(identity, records)
+    return records
 
-    seconds: float
-    ratio: float
+
+def _beside_the_reference(group: dict[str, Case], settings: Settings) -> list[dict[str, Any]]:
+    """Return times [s], ratios to the reference and memory [B] of some cases, timed in turns with the reference, each in a separate process.
+
+    Only these processes exist at a time, because a training step may keep gigabytes.
+    """
+    together = {REFERENCE: Case(**REFERENCE_CASE), **group}
+    values: dict[tuple[str, str], float] = {}
+    with apart({name: partial(Passes, case, settings) for name, case in together.items()}, [__name__]) as passes:
+        for name, case in together.items():
+            if settings.device != "cpu" or not (case.compiled or case.precision != "highest"):
+                values |= {(name, metric): value for metric, value in passes[name]("peaks").items()}
+        for kind, num_rounds in (("forward", settings.num_rounds), ("training", max(1, settings.num_rounds // 2))):
+            times = paired_times({name: partial(call, kind) for name, call in passes.items()}, num_rounds, num_warmups=1)
+            for name in together:
+                values[name, f"{kind}_time"] = float(np.median(times[name]))
+                values[name, f"{kind}_ratio"] = paired_ratio(times, name, REFERENCE)
+    return [{"case": name, "metric": metric, "value": value} for (name, metric), value in values.items()]
 
 
-def _beside_the_reference(
-    make: Callable[[Case, Settings], Callable[[], Any]], todo: dict[str, Case], settings: Settings, num_rounds: int, what: str
-) -> dict[str, Timing]:
-    """Time every case in turns with the reference, each in a separate process. Only these two exist at a time, because a training step may keep gigabytes."""
-    found = {}
-    with apart({REFERENCE: partial(make, todo[REFERENCE], settings)}) as reference:
-        for name, case in todo.items():
-            with apart({} if name == REFERENCE else {name: partial(make, case, settings)}) as other:
-                times = paired_times(reference | other, num_rounds, num_warmups=3)
-            found[name] = Timing(float(np.median(times[name])), paired_ratio(times, name, REFERENCE))
-            log.info("%s, %s: %.3f s", what, name, found[name].seconds)
-    return found
+def _case_records(
+    settings: Settings, todo: dict[str, Case], of_case: dict[str, dict[str, float]], spec: FeatureSpec, graph: HeteroData
+) -> list[dict[str, Any]]:
+    """Return the records of all cases from their times and memory, with the rates of this machine."""
+    size = settings.num_message_passing_steps, settings.hidden_channels, settings.seed
+    gemm = gemm_rate(sum(graph[r].edge_index.shape[1] for r in spec.relations), settings.hidden_channels, settings.device)
+    copy = copy_rate(settings.device)
+    records: list[dict[str, Any]] = [
+        {"metric": "gemm_rate", "case": settings.device, "value": gemm, "unit": "FLOP/s"},
+        {"metric": "copy_rate", "case": settings.device, "value": copy, "unit": "B/s"},
+    ]
+    for name, case in todo.items():
+        own = of_case[name]
+        values: dict[str, tuple[float, str]] = {
+            "forward_time": (own["forward_time"], "s"),
+            "training_time": (own["training_time"], "s"),
+            "forward_speedup": (1 / own["forward_ratio"], "1"),
+            "forward_speedup_vs_gns": (of_case["GNS"]["forward_ratio"] / own["forward_ratio"], "1"),
+            "training_speedup": (1 / own["training_ratio"], "1"),
+        }
+        if case.precision != "highest":
+            found, expected = (_prediction(todo[n], settings) for n in (name, name.removesuffix(MEDIUM)))
+            values["forward_difference"] = (float((found - expected).norm() / expected.norm()), "1")
+        elif case.model == "GPE":
+            if case.saves_against is not None:
+                values["forward_time_saved"] = (1 - own["forward_ratio"] / of_case[case.saves_against]["forward_ratio"], "1")
+            values["flop"] = (flop(case.build(spec, *size), graph), "FLOP")
+            values["flop_floor"] = (values["flop"][0] / gemm, "s")
+            values["byte_floor"] = (edge_bytes(case, spec, graph, settings) / copy, "s")
+            values["floor_ratio"] = (own["forward_time"] / values["flop_floor"][0], "1")
+        values |= {metric: (own[metric], "B") for metric in ("peak_memory", "training_peak_memory") if metric in own}
+        records += [{"metric": metric, "case": name, "value": value, "unit": unit} for metric, (value, unit) in values.items()]
+    return records
+
+
+def _prediction(case: Case, settings: Settings) -> Tensor:
+    return cast(Tensor, Passes(case, settings).forward().acceleration[SAND])
 
 
 def _graph_records(settings: Settings) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -153,6 +153,19 @@ def peak_on_gpu(function: Callable[[], Any]) -> int:
     torch.cuda.reset_peak_memory_stats()
     synchronized(function, "cuda")()
     return torch.cuda.max_memory_allocated() - before
+
+
+def peaks_in_turn(functions: Mapping[str, Callable[[], Any]]) -> dict[str, int]:
+    """Call functions one after the other, and return the memory that each needs in addition to the memory in use before the first [bytes], by name.
+
+    Call it in a process that did nothing like this before, because memory that an earlier call has freed is not counted. The peak of a function is at least
+    that of those before it. On a GPU use ``peak_on_gpu`` instead.
+    """
+    before, found = _resident(), dict[str, int]()
+    for name, function in functions.items():
+        function()
+        found[name] = peak_resident() - before
+    return found
 
 
 def peak_memory(function: Callable[..., Callable[[], Any]], *arguments: Any) -> int:

@@ -7,7 +7,7 @@ import logging
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from multiprocessing.connection import Connection
@@ -54,19 +54,22 @@ def paired_ratio(times: Mapping[str, np.ndarray], name: str, reference: str) -> 
 
 
 @contextmanager
-def apart(factories: Mapping[str, Callable[[], Callable[[], Any]]]) -> Iterator[dict[str, Callable[[], None]]]:
-    """Yield functions, by name, that run in separate processes. A call waits until the function has run there, and returns nothing.
+def apart(
+    factories: Mapping[str, Callable[[], Callable[..., Any]]], modules: Sequence[str] = ()
+) -> Iterator[dict[str, Callable[..., Any]]]:
+    """Yield functions, by name, that run in separate processes. A call sends its arguments there, waits, and returns the result.
 
     Functions with large arrays that share a process also share its heap, and slow each other down by up to a third. Returning memory to the system can cost as
     much. Here each function has a process and a heap of its own, which keeps freed memory (with glibc).
 
     Args:
-        factories: picklable functions that are called in the new processes and return the functions to run.
+        factories: picklable functions that are called in the new processes and return the functions to run. Arguments and results must be picklable.
+        modules: modules that the new processes share, if the system can start processes so. They are imported once.
 
     Raises:
         RuntimeError: a process ended; its error is on the standard error.
     """
-    context = multiprocessing.get_context("spawn")
+    context = _context(modules)
     with ExitStack() as stack:
         connections = {}
         for name, factory in factories.items():
@@ -82,18 +85,26 @@ def apart(factories: Mapping[str, Callable[[], Callable[[], Any]]]) -> Iterator[
         yield {name: partial(_call, name, connection) for name, connection in connections.items()}
 
 
-def _serve(connection: Connection, factory: Callable[[], Callable[[], Any]]) -> None:
+def _context(modules: Sequence[str]) -> Any:
+    """Return a way to start processes that have nothing of this one."""
+    if not modules or "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([*modules])
+    return context
+
+
+def _serve(connection: Connection, factory: Callable[[], Callable[..., Any]]) -> None:
     """Run the function at every request, until the connection is closed."""
     _keep_memory()
     function = factory()
     connection.send(None)
     while True:
         try:
-            connection.recv()
+            arguments = connection.recv()
         except EOFError:
             return
-        function()
-        connection.send(None)
+        connection.send(function(*arguments))
 
 
 def _keep_memory() -> None:
@@ -104,16 +115,16 @@ def _keep_memory() -> None:
         libc.mallopt(M_TRIM_THRESHOLD, -1)
 
 
-def _call(name: str, connection: Connection) -> None:
+def _call(name: str, connection: Connection, *arguments: Any) -> Any:
     try:
-        connection.send(None)
+        connection.send(arguments)
     except OSError:
         raise RuntimeError(f"{name}: its process has ended") from None
-    _wait(name, connection)
+    return _wait(name, connection)
 
 
-def _wait(name: str, connection: Connection) -> None:
+def _wait(name: str, connection: Connection) -> Any:
     try:
-        connection.recv()
+        return connection.recv()
     except (EOFError, OSError):
         raise RuntimeError(f"{name}: its process ended; its error stands above") from None

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from gpe_pl.system import machine
-from gpe_pl.system.machine import commit, copy_rate, environment, gemm_rate, peak_memory
+from gpe_pl.system.machine import commit, copy_rate, environment, gemm_rate, peak_memory, peaks_in_turn
+from gpe_pl.system.timing import apart
 
 
 def filling(num_bytes: int) -> Callable[[], int]:
@@ -49,6 +50,17 @@ def test_rates_are_positive() -> None:
 def test_memory_is_what_a_function_takes() -> None:
     small, large = peak_memory(filling, 10**6), peak_memory(filling, 3 * 10**8)
     assert 0.9 * 3e8 < large < 1.5 * 3e8 and small < 1e8
+
+
+def peaks() -> Callable[[], dict[str, int]]:
+    return lambda: peaks_in_turn({"small": filling(10**6), "large": filling(3 * 10**8)})
+
+
+@pytest.mark.slow
+def test_memory_of_functions_in_one_process_is_what_each_takes() -> None:
+    with apart({"peaks": peaks}) as calls:
+        found = calls["peaks"]()
+    assert 0.9 * 3e8 < found["large"] < 1.5 * 3e8 and found["small"] < 1e8
 
 
 @pytest.mark.slow

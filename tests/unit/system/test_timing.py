@@ -46,6 +46,16 @@ def test_each_alternative_is_made_once_in_a_process_of_its_own_and_called_there(
     assert all(len(t) == 2 for t in times.values())
 
 
+def adding(number: int) -> Callable[[int], int]:
+    return lambda other: number + other
+
+
+@pytest.mark.parametrize("modules", [[], [__name__]])
+def test_arguments_go_to_the_process_and_results_come_back(modules: list[str]) -> None:
+    with apart({"sum": partial(adding, 3)}, modules) as calls:
+        assert [calls["sum"](4), calls["sum"](-3)] == [7, 0]
+
+
 @pytest.mark.parametrize("factory", [failing, unmade])
 def test_an_alternative_that_fails_is_named(factory: Callable[[], Callable[[], None]]) -> None:
     with pytest.raises(RuntimeError, match="broken: its process ended"), apart({"broken": factory}) as calls:
