@@ -312,7 +312,7 @@ def _beside_the_reference(group: dict[str, Case], settings: Settings) -> list[di
     with apart({name: partial(Passes, case, settings) for name, case in together.items()}, [__name__]) as passes:
         for name, case in together.items():
             if settings.device != "cpu" or not (case.compiled or case.precision != "highest"):
-                values |= {(name, metric): value for metric, value in passes[name]("peaks").items()}
+                values |= {(name, metric): float(value) for metric, value in passes[name]("peaks").items()}
         for kind, num_rounds in (("forward", settings.num_rounds), ("training", max(1, settings.num_rounds // 2))):
             times = paired_times({name: partial(call, kind) for name, call in passes.items()}, num_rounds, num_warmups=1)
             for name in together:
