@@ -276,14 +276,14 @@ def run(
     records += _graph_records(settings)
     steps, training_steps = list[dict[str, Any]](), list[dict[str, Any]]()
     for name, spec in specs.items():
-        identity = {
+        about: dict[str, Any] = {
             "num_rounds": settings.num_rounds,
             "model": fingerprint_of(LearnedSimulator.from_checkpoint(name)),
             "data": spec.as_dict(),
         }
-        steps += _measured(parts, identity | {"part": "step"}, name, partial(step_records, {name: spec}, STEP_ROUNDS * settings.num_rounds))
+        steps += _measured(parts, about | {"part": "step"}, name, partial(step_records, {name: spec}, STEP_ROUNDS * settings.num_rounds))
         training = partial(training_records, {name: spec}, {name: trainings[name]}, settings.num_rounds)
-        training_steps += _measured(parts, identity | {"part": "training", "training": asdict(trainings[name])}, name, training)
+        training_steps += _measured(parts, about | {"part": "training", "training": asdict(trainings[name])}, name, training)
     parts.clear()
     tables = [table(settings, num_edges, records), *([step_table(steps), training_table(training_steps)] if steps else [])]
     return records + steps + training_steps, "\n\n".join(tables)

@@ -168,7 +168,7 @@ def test_what_bodies_have_at_rest_is_found_once() -> None:
     build, s = cells("triangles")
     first, later = build(s.to_torch())["elastomer"], build(replace(s, pos=s.pos + 1e-3).to_torch())["elastomer"]
     assert first.rest_pos is later.rest_pos and first.cell_index is later.cell_index
-    other = build(replace(s, rest_pos=1.1 * s.rest_pos).to_torch())["elastomer"]
+    other = build(replace(s, rest_pos=1.1 * np.asarray(s.rest_pos)).to_torch())["elastomer"]
     torch.testing.assert_close(other.rest_pos, 1.1 * first.rest_pos)
 
 

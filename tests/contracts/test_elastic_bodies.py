@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -109,7 +109,7 @@ def beside_an_obstacle(seed: int, kind: str, num_bodies: int) -> State:
 @pytest.mark.parametrize("stiffness", [0.0, 2.0])  # cells with the second are softened
 def test_the_compiled_motion_equals_the_plain_one(kind: str, is_double: bool, tolerance: float, stiffness: float) -> None:
     simulated = simulator(("solid",), 3 if kind == "tetrahedra" else 2, stress=True)
-    build, model = simulated.builder, simulated.model
+    build, model = simulated.builder, cast(GPE, simulated.model)
     if is_double:
         build, model = DoubleBuilder(build.config, build.metadata), model.double()
     with torch.no_grad():

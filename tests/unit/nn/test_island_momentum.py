@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -108,7 +110,7 @@ def test_compiled_contacts_move_bodies_as_plain_operations_do(
     a, mass, pos, body = scene(dim)
     forces = torch.randn(a.shape, generator=torch.Generator().manual_seed(1), dtype=a.dtype)
     body = torch.where(body == 4, -1, body)
-    inputs = *(t.to(dtype) for t in (a, forces, mass, pos)), body, len(SIZES) - 1, *modes
+    inputs: tuple[Any, ...] = *(t.to(dtype) for t in (a, forces, mass, pos)), body, len(SIZES) - 1, *modes
     with torch.no_grad():
         found = moved_by_contacts(*inputs)
         with unfused():
