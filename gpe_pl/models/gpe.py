@@ -410,8 +410,7 @@ class GPE(Model):
         count = body.shape[0] if torch.compiler.is_exporting() else int(data.num_bodies.sum())  # upper bound of the number
         forces, own = _joined([*contact.values()]), _joined([acceleration[m] for m in contact])
         # with the law, forces act where the contact is, and cells pass them on
-        are_rigid, only_contacts = not self.settings["elastic"], bool(self.settings["only_contacts"])
-        new = moved_by_contacts(own, forces, mass, pos, body, count, are_rigid, only_contacts)
+        new = moved_by_contacts(own, forces, mass, pos, body, count, not self.settings["elastic"], bool(self.settings["only_contacts"]))
         parts = new.split([a.shape[0] for a in contact.values()])
         return acceleration | dict(zip(contact, parts, strict=True))
 
