@@ -230,22 +230,33 @@ def test_a_pile_rests_by_the_static_friction_that_ships(
     spec: DatasetSpec, scenes: list[Trajectory], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = subject(spec, scenes, **SHIPPED)
-    still = replace(own.state(), vel=torch.zeros_like(own.state().vel))
-    monkeypatch.setattr(horizon, "settle", lambda _: still)
-    fractions: list[float] = []
+    monkeypatch.setattr(horizon, "settle", lambda _: scenes[0].state(5, 0))
+    fractions: list[float | None] = []
 
-    def stays(tested: Subject, _: State) -> Outcome:
-        fractions.append(tested.simulator.static_friction)
-        return Outcome(fractions[-1] > 0.1, "farthest 0")
+    def drift(_: Subject, simulator: Any, __: State) -> horizon.Drift:
+        fractions.append(None if simulator is spec.label_solver else simulator.simulator.static_friction)
+        return horizon.Drift(0.3 if fractions[-1] else 0.7 if fractions[-1] is not None else solver, 0.1, 0.0, None)
 
-    monkeypatch.setattr(horizon, "stays", stays)
-    for fraction, other, passed in ((0.0, 0.5, False), (0.25, 0.0, True)):
+    monkeypatch.setattr(horizon, "drift", drift)
+    for fraction, other, solver, passed in ((0.0, 0.5, 0.2, False), (0.25, 0.0, 0.1, False), (0.25, 0.0, 0.2, True), (0.0, 0.5, 0.4, True)):
         own.simulator.static_friction = fraction
         (kept,) = suite.subjects("sand", spec, {"GPE": own.simulator}, Settings({}, num_scenes=1))
         outcome = horizon.rest(kept)
-        assert (fractions[-2:], outcome.passed) == ([fraction, other], passed)
-        assert outcome.measured.startswith("without static friction: " if fraction == 0 else "with static friction 0.25: ")
+        assert (fractions[-3:], outcome.passed) == ([None, fraction, other], passed)  # the solver's own drift widens the limit
+        assert outcome.measured.startswith("without static friction: " if fraction == 0 else "static friction 0.25: farthest 0.3")
+        assert f"solver: farthest {solver}" in outcome.measured
         assert invariances.in_double(own.simulator).static_friction == fraction
+
+
+@pytest.mark.slow
+def test_a_pile_at_rest_is_compared_with_the_solvers_own_drift(spec: DatasetSpec, scenes: list[Trajectory]) -> None:
+    own = replace(subject(spec, scenes, **SHIPPED), spec=replace(spec, num_frames=200), horizon_factors=(5.0,), num_rest_steps=20)
+    settled = horizon.settle(own)
+    assert isinstance(settled, State) and not settled.vel.any()
+    solver = horizon.drift(own, spec.label_solver, settled)
+    assert 0 < solver.farthest < 20 * horizon.AT_REST and solver.stop is None
+    outcome = horizon.rest(own)
+    assert outcome.passed is False and outcome.measured.endswith(f"solver: {solver.text}")  # an untrained model lets the pile fall
 
 
 @pytest.mark.parametrize("tests", [[], [1]])
