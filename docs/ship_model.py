@@ -26,6 +26,7 @@ from gpe_pl.reports.domain_table import EVALUATED, NOT_LEARNED
 from gpe_pl.reports.finished_runs import table_of
 from gpe_pl.reports.sweep_table import summary
 
+SUITES: tuple[Suite, ...] = ("acceptance", "stability")
 REFUSED = "Other frame intervals and spacings are refused."
 
 
@@ -119,8 +120,7 @@ def judged(results: Path) -> None:
         SealError: a file of results is damaged.
         ValueError: the results are of another checkpoint.
     """
-    suites: tuple[Suite, ...] = ("acceptance", "stability")
-    for suite in suites:
+    for suite in SUITES:
         for path in sorted(results.glob(f"*{verdicts.suffix(suite)}")):
             checkpoint = FOLDER / f"{path.name.removesuffix(verdicts.suffix(suite))}.ckpt"
             measured = verdicts.read(path)
@@ -140,13 +140,15 @@ def _write_headline(checkpoint: Path) -> None:
 
 
 def rested(name: str, fraction: float) -> None:
-    """Set the static friction of a shipped model, and say so on its card. The headline is then that of a model which no suite has seen."""
+    """Set the static friction of a shipped model, and say so on its card. Verdicts on the model before are deleted."""
     checkpoint = FOLDER / f"{name}.ckpt"
     simulator = LearnedSimulator.from_checkpoint(checkpoint)
     about = checkpoint.with_suffix(".md")
     text = about.read_text().replace(_resting(simulator), "") if simulator.static_friction else about.read_text()
     simulator.static_friction = fraction
     simulator.save(checkpoint)
+    for suite in SUITES:
+        verdicts.path_beside(checkpoint, suite).unlink(missing_ok=True)
     about.write_text(text.replace(REFUSED, f"{REFUSED}{_resting(simulator)}", 1))
     _write_headline(checkpoint)
 

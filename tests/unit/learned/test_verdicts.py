@@ -67,6 +67,7 @@ def test_a_card_says_that_its_model_has_static_friction(tmp_path: Path) -> None:
     rested.__globals__["FOLDER"] = tmp_path
     for path in (checkpoint_path("snow"), checkpoint_path("snow").with_suffix(".md")):
         shutil.copy(path, tmp_path)
+    write(tmp_path / "snow.acceptance.json", Verdict(checksum(tmp_path / "snow.ckpt"), [GOOD]))
     weights = LearnedSimulator.from_checkpoint("snow").state_dict()
     for fraction, count in ((0.25, 1), (0.125, 1), (0.0, 0)):
         rested("snow", fraction)
