@@ -7,7 +7,7 @@ loaded as code.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
@@ -95,6 +95,23 @@ def read(path: Path) -> Verdict:
     except ValidationError as error:
         fault = error.errors()[0]
         raise sealed.SealError(f"{path}: {'.'.join(map(str, fault['loc']))}: {fault['msg']}; {advice}") from None
+
+
+def added(path: Path, verdict: Verdict, measured: Collection[str]) -> Verdict:
+    """Return a verdict with the checks of an earlier one on the same checkpoint that were not measured again, in the order of their names' numbers.
+
+    Args:
+        path: file of the earlier verdict; it may be missing.
+        verdict: the new verdict.
+        measured: names of all checks that were measured now, also of those that did not apply.
+
+    Raises:
+        SealError: the file is damaged.
+    """
+    if not path.exists() or (before := read(path)).checkpoint != verdict.checkpoint:
+        return verdict
+    kept = [check for check in before.checks if check.name not in measured]
+    return Verdict(verdict.checkpoint, sorted([*verdict.checks, *kept], key=lambda check: int(check.name.partition(" ")[0])))
 
 
 def headline(checkpoint: Path | str) -> str:

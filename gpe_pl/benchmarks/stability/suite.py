@@ -88,8 +88,8 @@ class Settings:
 def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tuple[list[dict[str, Any]], str]:
     """Return a record per test and model, and a Markdown table per domain. Data sets without a model are not tested.
 
-    Tests that had finished when an earlier run was stopped are not repeated. ``folder`` keeps their records until the suite ends. If all tests were run, the
-    verdict on each checkpoint is written beside it, or to ``folder`` for a shipped model.
+    Tests that had finished when an earlier run was stopped are not repeated. ``folder`` keeps their records until the suite ends. The
+    verdict on each checkpoint is written beside it, or to ``folder`` for a shipped model; tests that were not run keep their earlier results.
 
     Raises:
         NothingToTestError: no data set has a model, or two models of a data set have one name.
@@ -111,10 +111,9 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
             f"{', '.join(f'{s.name} {s.size}' for s in specs.values())}; train with `python -m gpe_pl.fit data={untested[0]} model=gpe_tuned` or set "
             "suite.runs or suite.checkpoints"
         )
-    if not settings.tests:
-        for name, spec in tested.items():
-            for label, _, path in _models(spec, settings):
-                _write_verdict(path, [r for r in records if (r["domain"], r["model"]) == (name, label)], folder)
+    for name, spec in tested.items():
+        for label, _, path in _models(spec, settings):
+            _write_verdict(path, [r for r in records if (r["domain"], r["model"]) == (name, label)], folder)
     parts.clear()
     return records, _report(records, untested)
 
@@ -124,11 +123,8 @@ def _write_verdict(path: Path, records: Sequence[dict[str, Any]], folder: Path) 
     checks = [
         Check(r["test"], r["status"] == "passed", r["measured"], "", r["criterion"]) for r in records if r["status"] != "not_applicable"
     ]
-    verdict = Verdict(verdicts.checksum(path), checks)
-    if path.parent == FOLDER:
-        verdicts.write(folder / f"{path.stem}{verdicts.suffix('stability')}", verdict)
-    else:
-        verdicts.write(verdicts.path_beside(path, "stability"), verdict)
+    target = folder / f"{path.stem}{verdicts.suffix('stability')}" if path.parent == FOLDER else verdicts.path_beside(path, "stability")
+    verdicts.write(target, verdicts.added(target, Verdict(verdicts.checksum(path), checks), {r["test"] for r in records}))
 
 
 def _show_progress() -> None:

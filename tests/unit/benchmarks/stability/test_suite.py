@@ -259,16 +259,26 @@ def test_a_pile_at_rest_is_compared_with_the_solvers_own_drift(spec: DatasetSpec
     assert outcome.passed is False and outcome.measured.endswith(f"solver: {solver.text}")  # an untrained model lets the pile fall
 
 
-@pytest.mark.parametrize("tests", [[], [1]])
-def test_verdicts_are_stored_beside_the_checkpoint_after_all_tests(
-    spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tests: list[int]
+def test_verdicts_are_stored_beside_the_checkpoint_and_completed(
+    spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    subject(spec, scenes, **SHIPPED).simulator.save(tmp_path / "own.ckpt")
-    verdicts = {1: True, 2: False, 5: None}
-    monkeypatch.setattr(suite, "_outcome", lambda stress_test, _: Outcome(verdicts.get(stress_test.number, True), "4 spacings"))
-    settings = Settings({"sand": Case([])}, [], [str(tmp_path / "own.ckpt")], SHIPPED, 1, [1.0], 5, tests)
-    run(settings, {"sand": spec}, tmp_path / "results")
-    assert headline(tmp_path / "own.ckpt").partition(". ")[2] == ("" if tests else "Fails 1 of 29 stress tests: 2 edge orientation")
+    simulator, checkpoint = subject(spec, scenes, **SHIPPED).simulator, tmp_path / "own.ckpt"
+    simulator.save(checkpoint)
+    outcomes: dict[int, bool | None] = {1: True, 2: False, 5: None}
+    monkeypatch.setattr(suite, "_outcome", lambda stress_test, _: Outcome(outcomes.get(stress_test.number, True), "4 spacings"))
+
+    def stored(*tests: int) -> str:
+        settings = Settings({"sand": Case([])}, [], [str(checkpoint)], SHIPPED, 1, [1.0], 5, [*tests])
+        run(settings, {"sand": spec}, tmp_path / "results")
+        return headline(checkpoint).partition(". ")[2]
+
+    assert stored(1, 5) == "Passes 1 of 1 stress tests"
+    assert stored() == "Fails 1 of 29 stress tests: 2 edge orientation"
+    outcomes |= {2: None, 12: False}
+    assert stored(2, 5, 12) == "Fails 1 of 28 stress tests: 12 coincident particles"
+    simulator.acceleration_std.fill_(2.0)
+    simulator.save(checkpoint)
+    assert stored(1) == "Passes 1 of 1 stress tests"  # another checkpoint keeps nothing
 
 
 def test_failures_of_gating_models_fail_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
