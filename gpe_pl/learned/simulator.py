@@ -394,8 +394,10 @@ class LearnedSimulator(nn.Module):
 
     def _standards(self, states: list[State]) -> Standards | None:
         """Return the statistics with which compiled features of these states are standardised; None if features have to be standardised afterwards."""
-        if self.static_friction or self.standardizer.mass.dtype != self.builder.precision or not all(map(works_on, states)):
-            return None  # static friction reads velocities of walls from the graph
+        if self.standardizer.mass.dtype != self.builder.precision or not all(map(works_on, states)):
+            return None
+        if self.static_friction and any(bool(state.boundary.vel.any()) for state in states):
+            return None  # static friction reads from the graph which walls move
         return self.standardizer.standards(dict(self.trained_ranges()) if self.clamps_parameters else None)
 
     def _graph(self, state: State, standards: Standards | None) -> HeteroData:
@@ -420,11 +422,14 @@ class LearnedSimulator(nn.Module):
         self._warn_of_unknown(graphs)
         data = graphs[0] if len(graphs) == 1 else batched(graphs)
         predicted = self.model(data) if is_standardized else self(data)
-        new = self.moved(states, graphs, predicted)
+        new = self.moved(states, graphs, predicted, walls_rest=is_standardized)
         return self._with_stress(new, graphs, predicted.stress) if predicted.stress else new
 
-    def moved(self, states: list[State], graphs: list[HeteroData], predicted: Prediction) -> list[State]:
-        """Return the states one frame later, given the states, their graphs, and the model's prediction for the batch of these graphs."""
+    def moved(self, states: list[State], graphs: list[HeteroData], predicted: Prediction, walls_rest: bool = False) -> list[State]:
+        """Return the states one frame later, given the states, their graphs, and the model's prediction for the batch of these graphs.
+
+        ``walls_rest`` is as in ``supported``.
+        """
         acceleration, dt = predicted.acceleration, self.builder.metadata.frame_dt
         if not self.static_friction and next_states.works_on_all(states, acceleration):
             new = next_states.moved(states, graphs, acceleration, float(self.acceleration_std), dt)
@@ -433,7 +438,7 @@ class LearnedSimulator(nn.Module):
         new = next_states.with_frame_velocity(new, graphs, predicted.frame_velocity, dt)
         if not self.static_friction:
             return new
-        return [self._with_static_friction(*parts) for parts in zip(states, new, graphs, strict=True)]
+        return [self._with_static_friction(*parts, walls_rest) for parts in zip(states, new, graphs, strict=True)]
 
     def accelerations(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[Tensor]:
         """Return the accelerations [node, dim] of each state in m/s², including gravity.
@@ -453,12 +458,12 @@ class LearnedSimulator(nn.Module):
         new = self.advance(state, acc)
         return self._with_static_friction(state, new, graph) if self.static_friction else new
 
-    def _with_static_friction(self, state: State, new: State, graph: HeteroData) -> State:
+    def _with_static_friction(self, state: State, new: State, graph: HeteroData, walls_rest: bool = False) -> State:
         """Return the new state, in which nodes that static friction keeps in place have their old positions and zero velocity."""
         island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
-        stays = keeps_position(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))[:, None]
+        stays = keeps_position(state.vel, new.vel, island, self.supported(graph, walls_rest), self.slowest(state.gravity))[:, None]
         new = new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))
         return new if new.frame_velocity is None else replace(new, frame_velocity=torch.where(stays, 0.0, new.frame_velocity))
 
@@ -466,10 +471,14 @@ class LearnedSimulator(nn.Module):
         """Return the speed [m/s] below which static friction keeps nodes in place."""
         return self.static_friction * self.builder.metadata.frame_dt * gravity.norm()
 
-    def supported(self, graph: HeteroData) -> Tensor:
-        """Return a mask [island] of the islands that static friction may keep in place, from a graph whose features are not standardised."""
+    def supported(self, graph: HeteroData, walls_rest: bool = False) -> Tensor:
+        """Return a mask [island] of the islands that static friction may keep in place: those that touch walls, none of which moves.
+
+        With ``walls_rest`` no wall of the scene moves. Otherwise the features of ``graph`` must not be standardised.
+        """
         spec = self.builder.spec
-        moves = (graph[BOUNDARY].x[:, : spec.dim] != 0).any(dim=1)
+        vel = graph[BOUNDARY].x[:, : spec.dim]
+        moves = torch.zeros(len(vel), dtype=torch.bool, device=vel.device) if walls_rest else (vel != 0).any(dim=1)
         walls = [relation for relation in spec.relations if relation[0] == BOUNDARY]
         edges = [(graph[relation].edge_index, graph[relation[2]].island) for relation in walls]
         return supported(graph.island_is_free, [(island[i], moves[j]) for (j, i), island in edges])

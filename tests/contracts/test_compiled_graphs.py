@@ -223,6 +223,7 @@ def test_changed_statistics_are_seen() -> None:
         ("bodies in contact", {"decoder": "contact", "node_norm": "layer"}, 0.0),
         ("periodic", {"island_momentum": "linear"}, 0.0),
         ("moving walls", {}, 0.0),
+        ("moving walls", {}, 0.5),
     ],
 )
 def test_steps_with_compiled_passes_equal_plain_ones(scene: str, settings: dict[str, Any], static_friction: float) -> None:

@@ -11,11 +11,13 @@ import pytest
 import torch
 from torch_geometric.data import HeteroData
 
+from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator, SceneError
 from gpe_pl.models.base import Prediction
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.static_friction import supported
 from gpe_pl.rollout.loop import rollout
+from gpe_pl.system.compiled import unfused
 from gpe_pl.trajectory.state import State
 from tests import scenes
 
@@ -66,6 +68,22 @@ def test_what_lies_on_a_wall_stays_and_what_flies_falls(materials: tuple[str, ..
     assert not held.vel[lies].any() and held.velocity_history is not None and not held.velocity_history[lies].any()
     assert torch.equal(held.pos[~lies], free.pos[~lies]) and torch.equal(held.vel[~lies], free.vel[~lies])
     assert free.vel[lies].any()
+
+
+def test_features_are_compiled_unless_a_wall_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    state, lies = lying_and_flying()
+    learned = simulator()
+    learned.static_friction = ENOUGH
+    standardized, made = GraphBuilder.standardized, []
+    monkeypatch.setattr(GraphBuilder, "standardized", lambda *args: made.append(None) or standardized(*args))
+    still = learned.step(state.to_torch())
+    assert len(made) == 1 and torch.equal(still.pos[lies], state.to_torch().pos[lies])
+    vel = np.zeros_like(state.boundary.vel)
+    vel[:] = [0.0, 1.0]
+    lifted = learned.step(replace(state, boundary=replace(state.boundary, vel=vel)).to_torch())
+    assert len(made) == 1 and (lifted.pos[lies] != state.to_torch().pos[lies]).any()
+    with unfused():
+        assert torch.equal(learned.step(state.to_torch()).pos, still.pos)
 
 
 def test_at_rest_is_for_ever() -> None:
