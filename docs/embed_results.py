@@ -3,8 +3,7 @@
 ``python docs/embed_results.py RUN_FOLDER NAME [NOTE]`` takes from a finished run, sweep or suite its tables, its figures in fewer colours, the first film, and
 where all of it comes from (``provenance.json``). It keeps the results of single rollouts in two small files (``gpe_pl.reports.run_archive``), from which
 ``python -m gpe_pl.reports docs/results/NAME`` makes the tables again. NOTE is what a reader should know besides, such as other work on the machine.
-RUN_FOLDER may also hold several evaluations by ``evaluate``, and their table by ``python -m gpe_pl.reports RUN_FOLDER``. The first scene of each at three
-values of the material parameter is then copied, too.
+RUN_FOLDER may also hold several evaluations by ``evaluate``, and their table by ``python -m gpe_pl.reports RUN_FOLDER``.
 ``python docs/embed_results.py`` only renews the README and the list in ``docs/results/README.md``; ``--check`` fails if one differs from the files.
 """
 
@@ -40,7 +39,6 @@ PICTURES = (
     *("acceptance_fem_beam.png", "acceptance_elastomer_square.png", "acceptance_sand_column.png"),
     *("acceptance_snow_cylinder.png", "acceptance_fluid_dam_break.png", "acceptance_sand_slump.png"),
 )
-AT_VALUES = "parameters_test_unseen_00.png"
 FILM = "rollout_test_00.gif"
 MAX_WIDTH = 1400
 NUM_COLORS = 128
@@ -68,9 +66,6 @@ def collect(run: Path, name: str, note: str = "") -> None:
     for path in sorted(run.glob("data=*/model=gpe_tuned/seed=0/rollout_test_unseen_00.png")) if is_table1 else ():
         picture(path, target / f"rollout_{path.parts[-4].removeprefix('data=')}.png")
     evaluations = [] if runs else evaluations_below(run)
-    for path in (found.folder / AT_VALUES for found in evaluations):
-        if path.exists():
-            picture(path, target / f"parameters_{path.parent.relative_to(run).as_posix().replace('/', '_')}.png")
     if (run / FILM).exists():
         film(run / FILM, (target / FILM).with_suffix(".webp"))
     if runs:

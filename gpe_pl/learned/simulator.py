@@ -426,10 +426,7 @@ class LearnedSimulator(nn.Module):
         return self._with_stress(new, graphs, predicted.stress) if predicted.stress else new
 
     def moved(self, states: list[State], graphs: list[HeteroData], predicted: Prediction, walls_rest: bool = False) -> list[State]:
-        """Return the states one frame later, given the states, their graphs, and the model's prediction for the batch of these graphs.
-
-        ``walls_rest`` is as in ``supported``.
-        """
+        """Return the states one frame later, given the states, their graphs, and the model's prediction for their batch; ``walls_rest`` as in ``supported``."""
         acceleration, dt = predicted.acceleration, self.builder.metadata.frame_dt
         if not self.static_friction and next_states.works_on_all(states, acceleration):
             new = next_states.moved(states, graphs, acceleration, float(self.acceleration_std), dt)
@@ -472,10 +469,7 @@ class LearnedSimulator(nn.Module):
         return self.static_friction * self.builder.metadata.frame_dt * gravity.norm()
 
     def supported(self, graph: HeteroData, walls_rest: bool = False) -> Tensor:
-        """Return a mask [island] of the islands that static friction may keep in place: those that touch walls, none of which moves.
-
-        With ``walls_rest`` no wall of the scene moves. Otherwise the features of ``graph`` must not be standardised.
-        """
+        """Return a mask [island] of the islands that static friction may keep in place. Without ``walls_rest``, features must not be standardised."""
         spec = self.builder.spec
         vel = graph[BOUNDARY].x[:, : spec.dim]
         moves = torch.zeros(len(vel), dtype=torch.bool, device=vel.device) if walls_rest else (vel != 0).any(dim=1)
