@@ -12,6 +12,7 @@ import torch
 from torch_geometric.data import HeteroData
 
 from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.standards import Standards
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator, SceneError
 from gpe_pl.models.base import Prediction
 from gpe_pl.models.gpe import GPE
@@ -74,8 +75,14 @@ def test_features_are_compiled_unless_a_wall_moves(monkeypatch: pytest.MonkeyPat
     state, lies = lying_and_flying()
     learned = simulator()
     learned.static_friction = ENOUGH
-    standardized, made = GraphBuilder.standardized, []
-    monkeypatch.setattr(GraphBuilder, "standardized", lambda *args: made.append(None) or standardized(*args))
+    standardized = GraphBuilder.standardized
+    made: list[State] = []
+
+    def counted(build: GraphBuilder, state: State, standards: Standards) -> HeteroData:
+        made.append(state)
+        return standardized(build, state, standards)
+
+    monkeypatch.setattr(GraphBuilder, "standardized", counted)
     still = learned.step(state.to_torch())
     assert len(made) == 1 and torch.equal(still.pos[lies], state.to_torch().pos[lies])
     vel = np.zeros_like(state.boundary.vel)
