@@ -110,7 +110,9 @@ def _rotations(acceleration, mass, pos, group, is_wanted, mean, centre, smallest
         if dim == 2:
             turn[g, 2] = moment[g, 2] / inertia[g, 2, 2] if inertia[g, 2, 2] > 0 else 0.0
         else:
-            turn[g] = _solved(inertia[g], moment[g], smallest)
+            solved = _solved(inertia[g], moment[g], smallest)
+            for d in range(3):
+                turn[g, d] = solved[d]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -313,17 +313,17 @@ def _fields(data, start, stop, wanted):
     while place < stop:
         number, _, begin, value, place = _field(data, place, stop)
         if place < 0:
-            detail[:] = value, begin
+            detail[0], detail[1] = value, begin
             return rows, -place, detail
         count += number == wanted
     if count > MAX_FIELDS:
-        detail[:] = count, 0
+        detail[0] = count
         return rows, _MANY, detail
     rows, count, place = np.empty((count, 3), np.int64), 0, start
     while place < stop:
         number, wire, begin, value, place = _field(data, place, stop)
         if number == wanted:
-            rows[count] = wire, begin, value
+            rows[count, 0], rows[count, 1], rows[count, 2] = wire, begin, value
             count += 1
     return rows, 0, detail
 
@@ -387,5 +387,7 @@ def _strings(data, rows, size):
         count += 1
     strings = np.empty((count, size), np.uint8)
     for k in range(count):
-        strings[k] = data[starts[k] : starts[k] + size]
+        own, field = strings[k], data[starts[k] : starts[k] + size]
+        for n in range(size):
+            own[n] = field[n]
     return strings
