@@ -93,7 +93,7 @@ class Settings:
     runs: list[str]
     factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [1.5, 2.0, 3.0])
     step_factors: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
-    soft_factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [4.0])
+    soft_factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [2.0, 4.0])
     repeats: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
     tuning: list[str] = field(default_factory=list)
     split: Split = "test_unseen"
@@ -324,6 +324,8 @@ def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[
             yield {"metric": "time_ratio_at_equal_error", **about, "horizon": horizon, "value": ratio, "unit": "1"}
             if (paired := ratio_at_cost(point, solvers, horizon)) is not None:
                 yield {"metric": "error_ratio_at_equal_time", **about, "horizon": horizon, **_of_interval(paired)}
+            if (paired := ratio_at_cost(point, _of_own_moduli(solvers), horizon)) is not None:
+                yield {"metric": "error_ratio_at_equal_time_and_moduli", **about, "horizon": horizon, **_of_interval(paired)}
             for data in (p for p in solvers if p.name == DATA):
                 paired = paired_ratio(point.mse[horizon], data.mse[horizon])
                 yield {"metric": "error_ratio_to_training_data", **about, "horizon": horizon, **_of_interval(paired)}
@@ -416,11 +418,23 @@ def _ratios(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
     for point in (p for p in points if p.family == "learned"):
         at_cost = [ratio_at_cost(point, solvers, h) for h in horizons]
         yield table_row([point.name, "solver of the same cost", *map(_ratio, at_cost)])
+        if (hard := _of_own_moduli(solvers)) != solvers:
+            at_cost = [ratio_at_cost(point, hard, h) for h in horizons]
+            yield table_row([point.name, "the same, moduli of the data", *map(_ratio, at_cost)])
         if data is not None:
             yield table_row([point.name, "solver of the data", *(_ratio(paired_ratio(point.mse[h], data.mse[h])) for h in horizons)])
     winning = winners(points, horizons)
     rule = f"A model wins if the 95 % interval over paired scenes lies below 1 at equal time, at {WINNING_HORIZONS} horizons or more."
     yield from ("", f"{rule} {'**' + ', '.join(winning) + '** wins.' if winning else 'None does.'}")
+    if (hard := _of_own_moduli(solvers)) != solvers:
+        winning = winners([*hard, *(p for p in points if p.family == "learned")], horizons)
+        found = f"{', '.join(winning)} would win" if winning else "none would win, either"
+        yield from ("", f"If the solver had to keep the elastic moduli of the data, {found}.")
+
+
+def _of_own_moduli(solvers: Sequence[Point]) -> list[Point]:
+    """Return the solvers whose elastic moduli are those of the data."""
+    return [p for p in solvers if MODULI not in p.name]
 
 
 def _ratio(interval: Interval | None) -> str:

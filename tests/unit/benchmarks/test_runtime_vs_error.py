@@ -216,6 +216,7 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
     assert "| exact model | **more accurate" in table and "| careless model | cheaper and less accurate" in table
     assert "@full: **below the solver's curve**: model, exact model." in table
     assert "order of convergence is 1.3" in table
+    assert "| model | the same, moduli of the data |" in table and "keep the elastic moduli of the data, none would" in table
     assert "| medium |" in table and "| worse |" not in table and "Of the solvers, 1 are only in `results.json`" in table
     axes = figures(records)["cost_error_sand"].axes[0]
     labels = [
