@@ -145,24 +145,25 @@ def cost_error_figure(panels: Mapping[str, CostAndError], x_label: str, y_label:
     for axes, (title, panel) in zip(all_axes, panels.items(), strict=True):
         axes.set_xscale("log")
         axes.set_yscale("log")
-        for style, (label, points) in zip(itertools.cycle(("s-", "D--", "^")), panel.lines.items(), strict=False):
+        for style, (label, points) in zip(itertools.cycle(("s-", "D", "^")), panel.lines.items(), strict=False):
             shown = sorted(p for p in points if np.isfinite(p[1]))
             axes.plot([c for c, _ in shown], [e for _, e in shown], style, markersize=3.5, linewidth=1, color="0.3", label=label)
         colors = {name: PALETTE[k % len(PALETTE)] for k, name in enumerate(dict.fromkeys(label.partition(",")[0] for label in panel.marks))}
         for label, points in panel.marks.items():
             shown, color = [p for p in points if np.isfinite(p[1])], colors[label.partition(",")[0]]
             face = "none" if "," in label else color
-            axes.plot([c for c, _ in shown], [e for _, e in shown], "o", markersize=4.5, color=color, markerfacecolor=face, label=label)
+            x, y = [c for c, _ in shown], [e for _, e in shown]
+            axes.plot(x, y, "o", markersize=5, markeredgewidth=1.4, color=color, markerfacecolor=face, label=label, zorder=4)  # above lines
         for style, (label, error) in zip((":", "--"), panel.levels.items(), strict=False):
             axes.axhline(error, linestyle=style, linewidth=1, color="0.6", label=label)
         low, high = np.log10(axes.get_xlim())
         axes.set_xlim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))  # whole decades, because labels between them would overlap
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_title(title, fontsize=8)
-        axes.set_xlabel(x_label, fontsize=7)
         axes.tick_params(which="both", labelsize=7)
         axes.spines[["top", "right"]].set_visible(False)
     all_axes[0].set_ylabel(y_label, fontsize=8)
+    figure.supxlabel(x_label, fontsize=8)  # below all panels, because it is wider than one of several
     handles, labels = all_axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=7, frameon=False, ncols=4, columnspacing=1.0, handlelength=1.6, loc="outside upper center")
     return figure
