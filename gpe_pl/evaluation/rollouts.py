@@ -42,9 +42,10 @@ def evaluate(
     """Roll out every trajectory of the splits, and write metrics and pictures to ``run_dir``.
 
     All rollouts start at ``settings.first_frame`` and run to the end of the ground truth. The files are ``metrics.csv`` with its digest, ``rollout_cost.json``
-    (see ``rollout_cost``) and ``error_curve_*.png``. The first ``settings.num_pictures`` trajectories of each split also get ``rollout_*.png``,
-    ``rollout_*.gif``, ``rollout_*.html`` (a viewer), ``stress_*.png`` if the model decodes a stress, and the files of ``settings.export``. With ``controls``,
-    those of ``test_unseen`` also get ``parameters_*.png``: the solver and the model at three values of the material parameters.
+    (see ``rollout_cost``) and, unless ``settings.num_pictures`` is 0, ``error_curve_*.png``. The first ``settings.num_pictures`` trajectories of each split
+    also get ``rollout_*.png``, ``rollout_*.gif``, ``rollout_*.html`` (a viewer), ``stress_*.png`` if the model decodes a stress, and the files of
+    ``settings.export``. With ``controls``, those of ``test_unseen`` also get ``parameters_*.png``: the solver and the model at three values of the material
+    parameters.
 
     These metrics are computed here, beside those of ``metrics.rollout_metrics``:
 
@@ -101,7 +102,7 @@ def evaluate(
                 write_exports(run_dir, split, number, scene.truth, scene.predictions[label], settings.export)
                 if scene.at_values:
                     write_parameter_picture(run_dir / f"parameters_{split}_{number:02d}.png", scene.at_values)
-        if curves:
+        if curves and settings.num_pictures:
             write_error_curve(run_dir / f"error_curve_{split}.png", curves, frame_dt)
     if "model" in settings.export:
         export_model(simulator, run_dir / "model.pt2")

@@ -33,7 +33,7 @@ class EvaluationSettings:
         static_friction: nodes that walls support stay in place if they are slower than this fraction of the speed that gravity gives in one frame (see
             ``nn.static_friction``); None takes the model's own value.
         material_controls: roll scenes with unseen parameters out with other parameters, too (see ``material_controls``).
-        num_pictures: number of trajectories per split that get a figure, an animation and a viewer.
+        num_pictures: number of trajectories per split that get a figure, an animation and a viewer. With 0, no curve of errors is drawn, either.
         export: what to write for other programs: the trajectories with pictures as ``vtk`` series, ``npz`` and ``mp4``, and the ``model`` (see
             ``export.program``).
     """

@@ -229,6 +229,7 @@ def test_a_finished_run_is_left_as_it_is(tiny_data: Path, tmp_path: Path, monkey
     cfg = tiny(tiny_data, tmp_path)
     value = fit(cfg)
     files = {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in tmp_path.rglob("*") if p.is_file()}
+    assert not [p for p in files if p.name.startswith(("error_curve", "rollout_test"))]  # evaluation.num_pictures=0
     monkeypatch.setattr(TrajectoryDataModule, "__init__", lambda *_, **__: pytest.fail("opened the data"))
     assert fit(cfg) == value
     assert {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in tmp_path.rglob("*") if p.is_file()} == files

@@ -28,11 +28,6 @@ from tests.runs import DATA, compose
 SETTINGS = EvaluationSettings(splits=["test", "test_unseen"], horizons=[0.025], num_pictures=0, num_uncontained=0, material_controls=True)
 
 
-@pytest.fixture(autouse=True)
-def _without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rollouts, "write_error_curve", lambda *_: None)
-
-
 @pytest.fixture(scope="module")
 def controls(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> MaterialControls:
     spec = dataset_spec(compose("simulate", *DATA))
@@ -91,7 +86,8 @@ def test_pictured_scenes_are_at_three_values_in_ascending_order(controls: Materi
 
 
 def test_controls_give_a_picture_of_three_values(controls: MaterialControls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rollouts, "write_pictures", lambda *_: None)
+    for other in ("write_pictures", "write_error_curve"):
+        monkeypatch.setattr(rollouts, other, lambda *_: None)
     evaluate(simulator(controls.root, "affine"), controls.root, replace(SETTINGS, num_pictures=1), tmp_path, controls=controls)
     assert [path.name for path in tmp_path.glob("*.png")] == ["parameters_test_unseen_00.png"]
 

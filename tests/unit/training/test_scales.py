@@ -141,11 +141,6 @@ def in_metres(folder: Path) -> tuple[list[float], int, list[Row]]:
     return trained(folder, folder / "run", 1.0, 1.0)
 
 
-@pytest.fixture(autouse=True)
-def _without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rollouts, "write_error_curve", lambda *_: None)
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the data sets in all units."""
