@@ -9,8 +9,8 @@ RUN_FOLDER may also hold several evaluations by ``evaluate``, and their table by
 
 from __future__ import annotations
 
+import lzma
 import re
-import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -41,6 +41,7 @@ PICTURES = (
 )
 FILM = "rollout_test_00.gif"
 MAX_WIDTH = 1400
+MAX_JSON = 65_536
 NUM_COLORS = 128
 
 
@@ -59,7 +60,7 @@ def collect(run: Path, name: str, note: str = "") -> None:
         for path in sorted(run.glob(pattern)):
             is_made_again = bool(runs) and path.name == "table.csv"  # from the results of single rollouts
             if not is_made_again and not (is_table1 and path.stem == "table"):  # of all its runs at once, which says nothing
-                shutil.copy(path, target / path.name)
+                record(path, target)
     for pattern in PICTURES:
         for path in sorted(run.glob(pattern)):
             picture(path, target / path.name)
@@ -75,6 +76,19 @@ def collect(run: Path, name: str, note: str = "") -> None:
     seeds = sorted({int(found.config["seed"]) for found in runs if "seed" in found.config})
     every = sessions(run) or [session for found in evaluations for session in sessions(found.folder)]
     sealed.write(target / PROVENANCE, {"sessions": every, "seeds": seeds, "note": note})
+
+
+def record(source: Path, folder: Path) -> None:
+    """Copy a file to a folder. JSON files of more than ``MAX_JSON`` bytes, which nobody reads as text, are compressed with xz."""
+    content = source.read_bytes()
+    is_long = source.suffix == ".json" and len(content) > MAX_JSON
+    target = folder / source.name
+    packed = target.with_name(f"{target.name}.xz")
+    (target if is_long else packed).unlink(missing_ok=True)  # of an earlier run
+    if is_long:
+        packed.write_bytes(lzma.compress(content))
+    else:
+        target.write_bytes(content)
 
 
 def picture(source: Path, target: Path) -> None:

@@ -7,6 +7,8 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from gpe_pl.graphs.compiled_features import write_arms
+
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
@@ -24,15 +26,11 @@ def write_velocities(vel, at_frame, rows, frame_dt, velocity):
 def write_from_centre(pos, shift, rows, body, num_bodies, body_pos):
     """Write positions relative to the mean of their body to ``body_pos`` [row, dim]; a ``shift`` [node, dim] in m is added if it has rows."""
     num_rows, dim = body_pos.shape
-    now, count, centre = np.empty((num_rows, dim)), np.zeros(num_bodies), np.zeros((num_bodies, dim))
+    now = np.empty((num_rows, dim))
     for k in range(num_rows):
-        count[body[k]] += 1.0
         for a in range(dim):
             now[k, a] = pos[rows[k], a] + (shift[rows[k], a] if shift.shape[0] else 0.0)
-            centre[body[k], a] += now[k, a]
-    for k in range(num_rows):
-        for a in range(dim):
-            body_pos[k, a] = now[k, a] - centre[body[k], a] / count[body[k]]
+    write_arms(now, body, num_bodies, body_pos)
 
 
 @njit(cache=True, error_model="numpy")
