@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from gpe_pl.config.entry_point import ConfigError, compose, construct, entry_point
 from gpe_pl.config.folder import CONF
+from gpe_pl.errors.printable import one_line
 from gpe_pl.files.atomic import replace_text
-from gpe_pl.printable import one_line
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -35,11 +35,11 @@ from gpe_pl.config.folder import CONF
 from gpe_pl.config.launcher import RESULT, USAGE_ERROR, SweepError, end_with_sweep
 from gpe_pl.config.typed_keys import without_effect
 from gpe_pl.errors import GpeError
+from gpe_pl.errors.printable import clean_messages, one_line, speak_utf8
 from gpe_pl.files.atomic import replace_text, unnamed
 from gpe_pl.files.names import NameRefused, run_name, sweep_name
 from gpe_pl.files.run_folder import refuse_links
 from gpe_pl.learned.pretrained import model_name
-from gpe_pl.printable import clean_messages, one_line, speak_utf8
 from gpe_pl.system import early_interrupts
 from gpe_pl.system.signatures import checked, parameters
 

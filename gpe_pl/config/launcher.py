@@ -33,8 +33,8 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gpe_pl.errors import GpeError
+from gpe_pl.errors.printable import one_line
 from gpe_pl.files.run_folder import RunError, refuse_links
-from gpe_pl.printable import one_line
 
 LOG = "output.log"
 """Name of the log file in the folder of a run."""

@@ -25,11 +25,11 @@ import numpy as np
 from gpe_pl.data import finer_labels_metadata
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.position_rounding import motion_of, rounding_fault
+from gpe_pl.errors.printable import printable, speak_utf8
 from gpe_pl.files.hdf5_arrays import attribute, is_named
 from gpe_pl.files.json_text import parsed
 from gpe_pl.geometry.shape_values import shapes_fault
 from gpe_pl.geometry.shapes import Shape
-from gpe_pl.printable import printable, speak_utf8
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
 from gpe_pl.trajectory.store import (
     StoreError,

@@ -1,6 +1,6 @@
 """Markdown tables."""
 
-from gpe_pl.printable import printable
+from gpe_pl.errors.printable import printable
 
 
 def table_row(cells: list[str]) -> str:

@@ -16,9 +16,9 @@ from typing import Literal
 from pydantic import TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
+from gpe_pl.errors.printable import one_line
 from gpe_pl.files import sealed
 from gpe_pl.learned.pretrained import checkpoint_path
-from gpe_pl.printable import one_line
 
 Suite = Literal["acceptance", "stability"]
 NOT_MEASURED = "acceptance not measured"

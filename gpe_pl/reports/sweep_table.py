@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from gpe_pl.errors.printable import printable
 from gpe_pl.evaluation.horizons import time_of
 from gpe_pl.evaluation.metric_rows import EXACT, LEARNED, read_rows
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import bootstrap_interval
-from gpe_pl.printable import printable
 from gpe_pl.reports.finished_runs import (
     UNSEEN_GROUPS,
     Run,

@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 from gpe_pl.errors import GpeError
+from gpe_pl.errors.printable import one_line, speak_utf8
 from gpe_pl.files.run_folder import RunError
-from gpe_pl.printable import one_line, speak_utf8
 from gpe_pl.reports.domain_table import TABLE_MD, compares_models, report_domains
 from gpe_pl.reports.evaluation_table import EVALUATIONS_MD, report_evaluations
 from gpe_pl.reports.finished_runs import Run, evaluations_below, finished_runs, is_evaluation

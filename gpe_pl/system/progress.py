@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from gpe_pl.printable import one_line
+from gpe_pl.errors.printable import one_line
 
 Progress = Callable[[int, int], Any]  # arguments: amount done, total amount
 

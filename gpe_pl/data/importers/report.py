@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from gpe_pl.errors.printable import printable
 from gpe_pl.files.atomic import replace_text
-from gpe_pl.printable import printable
 from gpe_pl.schema import MATERIALS
 
 REPORT_FILE = "report.json"

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gpe_pl.errors.printable import clean_messages
 from gpe_pl.export.trajectories import write_vtk
 from gpe_pl.files.atomic import FullDiskError, replace_bytes, replace_text, replacing, unnamed
 from gpe_pl.files.late_failure import LateFailure
-from gpe_pl.printable import clean_messages
 from gpe_pl.trajectory.store import read_trajectory, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
 

@@ -10,8 +10,8 @@ import warnings
 import pytest
 
 from gpe_pl.errors import GpeError
+from gpe_pl.errors.printable import LONGEST, LogRecord, clean_messages, one_line, printable
 from gpe_pl.files.markdown import table_row
-from gpe_pl.printable import LONGEST, LogRecord, clean_messages, one_line, printable
 from gpe_pl.trajectory.store import StoreError
 
 HOSTILE = "sand\x1b[2K\rerror: forged\nerror: forged\u202e\u2028\x9b31m"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gpe_pl.printable import one_line
+from gpe_pl.errors.printable import one_line
 
 
 class GpeError(Exception):
