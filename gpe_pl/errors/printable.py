@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 import io
 import logging
 import sys
 import traceback
 import warnings
+from collections.abc import Iterable
 from types import TracebackType
 
 LONGEST = 4000
@@ -73,3 +75,9 @@ def _one_line_warning(message: Warning | str, category: type[Warning], filename:
 def _print_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     for line in "".join(traceback.format_exception(kind, error, trace)).split("\n"):
         print(printable(line), file=sys.stderr)
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return ``; did you mean 'x'?`` with the known word that is most similar to one that is not known; an empty string if none is similar."""
+    close = difflib.get_close_matches(word.lower(), (by_lower := {str(each).lower(): str(each) for each in known}), n=1, cutoff=0.6)
+    return f"; did you mean {by_lower[close[0]]!r}?" if close else ""

@@ -147,3 +147,9 @@ def _own_folder() -> Path | None:
         return folder if is_own else Path(tempfile.mkdtemp(prefix="gpe_pl-"))
     except OSError:
         return None
+
+
+def has_compiled(source: str) -> bool:
+    """Tell whether the cache has compiled functions of a source file, given by its path in the package."""
+    folder = os.environ.get("NUMBA_CACHE_DIR")
+    return folder is not None and any(Path(folder).glob(f"*/{Path(source).stem}.*.nbi"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import shlex
 from pathlib import Path
@@ -12,9 +13,11 @@ import yaml
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from gpe_pl.__main__ import VERBS
 from gpe_pl.config.entry_point import _groups as groups
 from gpe_pl.config.entry_point import compose
 from gpe_pl.data.importers import Format
+from gpe_pl.system.command_line import parsed
 
 ROOT = Path(__file__).resolve().parents[2]
 GUIDE = ROOT / "docs" / "guide"
@@ -29,9 +32,12 @@ def commands() -> dict[str, tuple[str, list[str]]]:
     found: dict[str, tuple[str, list[str]]] = {}
     for page in PAGES:
         blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL)
-        lines = [*"\n".join(blocks).replace("\\\n", " ").splitlines(), *re.findall(r"`(python -m gpe_pl\.[^`]+)`", page.read_text())]
+        lines = [
+            *"\n".join(blocks).replace("\\\n", " ").splitlines(),
+            *re.findall(r"`((?:python -m gpe_pl\.|gpe )[^`]+)`", page.read_text()),
+        ]
         for command in (part.strip() for line in lines for part in line.split("&&")):
-            if match := re.match(r"python -m gpe_pl\.(fit|simulate|evaluate|benchmark|convert)\b(.*)", command):
+            if match := re.match(r"(?:python -m gpe_pl\.|gpe )(fit|simulate|evaluate|benchmark|convert)\b(.*)", command):
                 words = [word for word in shlex.split(match[2], comments=True) if word not in NO_COMPOSITION]
                 if not any("…" in word or word.isupper() for word in words):
                     found[f"{match[1]} {' '.join(words)}"] = match[1], [re.sub(r"^([^=\[{]+=[^,\[{]+),.*", r"\1", word) for word in words]
@@ -43,6 +49,19 @@ def commands() -> dict[str, tuple[str, list[str]]]:
 def test_commands_compose(name: str, overrides: list[str]) -> None:
     GlobalHydra.instance().clear()
     compose(name, [word for word in overrides if not word.startswith(("hydra/", "hydra."))])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+def test_verbs_of_the_console_script_exist(page: Path) -> None:
+    """Verbs without a configuration of Hydra have keys of their own."""
+    for block in re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL):
+        for line in block.replace("\\\n", " ").splitlines():
+            if match := re.match(r"gpe (\w+)(.*)", line):
+                verb, words = match[1], shlex.split(match[2], comments=True)
+                assert verb in VERBS or verb == "completion", line
+                if "." in VERBS[verb][0]:
+                    keys = importlib.import_module(f"gpe_pl.{VERBS[verb][0]}").KEYS
+                    parsed([word for word in words if "…" not in word], "word", keys)
 
 
 def named(page: str, key: str) -> set[str]:

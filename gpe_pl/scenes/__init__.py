@@ -1,0 +1,1 @@
+"""Scenes of your own: bodies and obstacles in a few lines, rolled out by a model and a solver."""

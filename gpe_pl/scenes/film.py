@@ -1,0 +1,96 @@
+"""``Film``: rollouts of one scene, with their error, pictures and viewer."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.errors import GpeError
+from gpe_pl.export.trajectories import write_npz
+from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.viz.browser import open_page
+from gpe_pl.viz.captions import describe, heading, with_heading
+from gpe_pl.viz.figures import rollout_figure
+from gpe_pl.viz.saving import save_figure
+from gpe_pl.viz.video import write_animation
+from gpe_pl.viz.viewer import write_viewer
+
+MOST_FRAMES = 200
+"""Largest number of frames in a viewer or animation. Of longer rollouts, every second, third, … frame is shown."""
+FIGURES = (".png", ".svg", ".pdf")
+ANIMATIONS = (".gif", ".mp4")
+
+
+class FilmFault(GpeError, ValueError):
+    """Raised for a file type that a film cannot be written as."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """Rollouts of one scene.
+
+    Attributes:
+        title: name of the scene.
+        first: the ground truth if there is one, else a prediction.
+        others: further rollouts with the same nodes and frames, by name.
+    """
+
+    title: str
+    first: Trajectory
+    others: Mapping[str, Trajectory]
+
+    def summary(self) -> str:
+        """Return one line per rollout: its length, its error if the first rollout is ground truth, and why it stopped if it stopped early."""
+        lines = [describe(self.first)]
+        for name, rollout in with_heading(self.first, self.others).items():
+            line = f"{name}: {(rollout.num_frames - 1) * rollout.metadata.frame_dt:.3g} s in {rollout.num_frames - 1} frames, {rollout.num_nodes} nodes"
+            if rollout is not self.first:
+                line += f"; distance from the {heading(self.first)} {self.distance(name):.3g} m (root mean square)"
+            lines.append(line + (f"; stopped early, {rollout.termination.message}" if rollout.termination is not None else ""))
+        return "\n".join(lines)
+
+    def distance(self, name: str) -> float:
+        """Return the root mean square distance [m] of the nodes of another rollout from those of the first, over the frames that both have."""
+        other = self.others[name]
+        count = min(self.first.num_frames, other.num_frames)
+        apart = other.pos[1:count].astype(np.float64) - self.first.pos[1:count]
+        return float(np.sqrt(np.mean(np.sum(apart**2, axis=-1)))) if count > 1 else 0.0
+
+    def write(self, path: Path | str) -> Path:
+        """Write a viewer (.html), a figure (.png, .svg, .pdf), an animation (.gif, .mp4), or the last rollout as arrays (.npz); returns the path.
+
+        Raises:
+            FilmFault: another file type.
+            OSError: the file cannot be written.
+        """
+        path = Path(path)
+        stride = max(1, -(-self.first.num_frames // MOST_FRAMES))
+        check_type(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".html":
+            write_viewer(path, self.first, self.others, stride=stride, title=self.title)
+        elif path.suffix in FIGURES:
+            save_figure(rollout_figure(self.first, self.others), path)
+        elif path.suffix in ANIMATIONS:
+            write_animation(path, self.first, self.others, stride=stride)
+        else:
+            write_npz(path, [self.first, *self.others.values()][-1])
+        return path
+
+    def show(self) -> Path:
+        """Open the viewer in a browser, and return its file. Where there is no browser, print where the file is."""
+        path = self.write(Path(tempfile.mkdtemp(prefix="gpe_")) / "film.html")
+        if not open_page(path):
+            print(f"no browser here; open {path}")
+        return path
+
+
+def check_type(path: Path) -> None:
+    """Raise ``FilmFault`` if a film cannot be written as a file of this type."""
+    known = (".html", *FIGURES, *ANIMATIONS, ".npz")
+    if path.suffix not in known:
+        raise FilmFault(f"{path}: files of type {path.suffix or 'none'} are not written; take one of {', '.join(known)}")

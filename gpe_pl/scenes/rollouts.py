@@ -1,0 +1,73 @@
+"""Rollouts of a state by a model and by the solver that made its training data, with containment and a guard."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import replace
+from typing import Any
+
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.training_ranges import stored_ranges
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import rollout
+from gpe_pl.system.caches import has_compiled
+from gpe_pl.system.compiled import unfused
+from gpe_pl.system.progress import progress_bar
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+
+QUICK = 200_000
+"""Node-frames up to which a rollout takes seconds without compiled passes. Compiling them takes longer, once for each version of the package."""
+
+
+def middle_values(simulator: LearnedSimulator) -> dict[str, dict[str, float]]:
+    """Return the middle of the trained range of each parameter, by material and name. For parameters that span decades this is the geometric mean."""
+    own = simulator.builder.metadata
+    return {
+        material: {spec.name: math.sqrt(low * high) if spec.scale == "log" else (low + high) / 2 for spec, _, (low, high) in found}
+        for material, trained in simulator.trained_ranges()
+        for found in [[(spec, column, ends.tolist()) for spec, column, ends in stored_ranges(own, material, trained)]]
+    }
+
+
+def guard_of(metadata: Metadata) -> Guard:
+    """Return the limits of a rollout: nodes may leave the domain by its size, as they do in a solver that has no walls."""
+    return Guard(bounds=metadata.bounds, margin=metadata.longest_side, spacing=metadata.spacing)
+
+
+def predicted(simulator: LearnedSimulator, state: State, metadata: Metadata, num_frames: int, label: str) -> Trajectory:
+    """Roll a model out from a state without earlier frames; a progress bar shows rate and remaining time.
+
+    Args:
+        simulator: the model.
+        state: state of the scene, as NumPy arrays.
+        metadata: metadata of the scene.
+        num_frames: number of frames after the start.
+        label: text beside the bar.
+
+    Raises:
+        SceneError: the scene does not fit the model.
+    """
+    start = simulator.standing(state, metadata)
+    is_quick = num_frames * state.num_nodes <= QUICK and not has_compiled("nn/network_program_kernels.py")
+    with unfused() if is_quick else contextlib.nullcontext(), progress_bar(label) as on_progress:
+        return rollout(
+            Contained(simulator, metadata.frame_dt),
+            start,
+            num_frames,
+            metadata,
+            guard_of(metadata),
+            lambda frame, _: on_progress(frame, num_frames),
+        )
+
+
+def solved(solver: Any, state: State, metadata: Metadata, num_frames: int, label: str) -> Trajectory:
+    """Roll a solver out from a state. Its frames may be shorter than those of ``metadata`` by a whole number; the result has those of ``metadata``."""
+    stride = max(1, round(metadata.frame_dt / solver.frame_dt))
+    stored = replace(metadata, frame_dt=solver.frame_dt, solver=solver.name, solver_version=solver.version, solver_dt=solver.solver_dt)
+    steps = math.ceil(num_frames * stride)
+    with progress_bar(label) as on_progress:
+        found = rollout(solver, state, steps, stored, guard_of(metadata), lambda frame, _: on_progress(frame, steps))
+    return found.every(stride) if stride > 1 else found

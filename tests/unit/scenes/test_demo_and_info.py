@@ -1,0 +1,80 @@
+"""``gpe demo`` and ``gpe info``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gpe_pl.learned.pretrained import names
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.scenes import demo, info
+from gpe_pl.scenes.film import FilmFault
+from gpe_pl.scenes.recorded import NotRecorded, recorded_scene, recorded_solver
+from gpe_pl.scenes.rollouts import middle_values
+from gpe_pl.system.command_line import ArgumentFault
+
+
+@pytest.mark.parametrize("model", names())
+def test_scene_and_solver_of_a_shipped_model_are_recorded(model: str) -> None:
+    simulator = LearnedSimulator.from_checkpoint(model)
+    own = simulator.builder.metadata
+    scene, solver = recorded_scene(own), recorded_solver(own)
+    assert (scene.materials, scene.spacing, scene.bounds) == (own.materials, own.spacing, own.bounds)
+    assert (solver.name, solver.frame_dt) == (own.solver, own.frame_dt)
+    state = scene.sample(middle_values(simulator), 0)
+    assert simulator.untrained_parameters(simulator.standing(state, own)) == []
+
+
+def test_imported_data_have_no_solver() -> None:
+    own = LearnedSimulator.from_checkpoint("sand").builder.metadata
+    with pytest.raises(NotRecorded, match="data set 'mine' comes from import/npz, so its scenes and solver are not known here"):
+        recorded_solver(replace(own, dataset="mine", solver="import/npz", config="{}"))
+
+
+def test_a_demo_is_a_viewer_and_says_where_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gpe_pl.viz.browser.has_desktop", lambda: False)
+    demo.run("sand", {"seconds": 0.01, "parameter": 27.5})
+    lines = capsys.readouterr().out.splitlines()
+    assert "sand, friction angle 27.5°" in lines
+    assert lines[-2:] == ["demo_sand.html", "no browser here; copy the file, which needs nothing else, and open it elsewhere"]
+    assert "friction angle 27.5°" in (tmp_path / "demo_sand.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("model", "values", "message"),
+    [
+        ("snad", {}, "gpe demo snad: name a shipped model .*; did you mean 'sand'?"),
+        (None, {}, "gpe demo: name a shipped model"),
+        ("sand", {"parameter": 80.0}, "parameter=80: friction_angle = 80.0 deg is outside 0 … 60, the solvers' limits"),
+        ("sand", {"file": Path("x.doc")}, "x.doc: files of type .doc are not written; take one of .html, .png, .svg"),
+    ],
+)
+def test_a_demo_that_cannot_be_is_refused(model: str | None, values: dict[str, object], message: str) -> None:
+    with pytest.raises((ArgumentFault, FilmFault), match=message):
+        demo.run(model, values)
+
+
+def test_info_says_settings_ranges_and_checks(capsys: pytest.CaptureFixture[str]) -> None:
+    info.run("sand", {"speed": False})
+    printed = capsys.readouterr().out
+    for part in (
+        "model: GPE with 181,972 parameters, for sand in 2D",
+        "friction_angle of sand: 20 to 42.5 deg",
+        "acceptance: 9 of 9 checks passed",
+    ):
+        assert part in printed
+    info.run(None, {})
+    assert all(f"\n{name}: " in f"\n{capsys.readouterr().out}" for name in names()[:1])
+    with pytest.raises(ArgumentFault, match="did you mean 'snow'?"):
+        info.run("snwo", {})
+
+
+@pytest.mark.slow
+def test_info_times_a_step(capsys: pytest.CaptureFixture[str]) -> None:
+    info.run("sand", {})
+    assert "ms for a frame of 320 nodes" in capsys.readouterr().out
