@@ -21,6 +21,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.solver_targets import SolverTargets
 from gpe_pl.data.statistics import FRAMES_AT_ONCE
+from gpe_pl.data.training_samples import Unroll, UnrollStart, training_graph
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.rollout.loop import Restartable
@@ -254,126 +255,6 @@ def _read_only(trajectory: Trajectory) -> Trajectory:
         if isinstance(array, np.ndarray):
             array.setflags(write=False)
     return trajectory
-
-
-@dataclass(frozen=True)
-class UnrollStart:
-    """The start of an unroll with the ground truth that follows.
-
-    Attributes:
-        state: initial state with noise, as float64 tensors.
-        truth: true positions in m, from the frame of ``state`` on [num_steps + 2, node, dim].
-        stress: true Cauchy stress in Pa, from the frame after ``state`` on [num_steps + 1, node, component]; None if the trajectory has none, or if
-            ``WindowDataset`` leaves it out.
-        position_correction: fraction of the deviation from the true position that the target removes within one step; see ``Noise``.
-        velocity_correction: fraction of the deviation from the true velocity that the target removes within one step, after the unroll; as in ``StartKey``.
-        about: attributes of the graphs: numbers of trajectory and frame, and the weight in the loss if there is one.
-        sample, lane: as in ``StartKey``.
-        solver_targets: computes targets with the solver instead of with the two corrections; None without a solver.
-    """
-
-    state: State
-    truth: Tensor
-    stress: Tensor | None
-    position_correction: float
-    velocity_correction: float
-    about: dict[str, Any]
-    sample: int
-    lane: int
-    solver_targets: SolverTargets | None = None
-
-    @property
-    def num_steps(self) -> int:
-        """Number of steps of the unroll."""
-        return self.truth.shape[0] - 2
-
-    def to(self, device: Any) -> UnrollStart:
-        """Return the same start on another device."""
-        stress = None if self.stress is None else self.stress.to(device)
-        return replace(self, state=self.state.to_torch(device), truth=self.truth.to(device), stress=stress)
-
-    def graph(self, builder: GraphBuilder, state: State, step: int) -> HeteroData:
-        """Create the training graph of the state that the model has reached after ``step`` steps.
-
-        The target is the acceleration that leads to a target velocity v*. With v̂ the next true velocity, Δv and Δx the deviations of velocity and position from
-        the truth, and c_v and c_x the two corrections, v* = v̂ + (1 − c_v) Δv − c_x Δx / Δt. At step 0, Δv is noise and c_v is 1. With ``solver_targets``, the
-        target is that of ``SolverTargets.target`` instead, unless the solver refuses the state.
-        """
-        if self.solver_targets is not None and (found := self.solver_targets.target(state, step)) is not None:
-            acceleration, stress = found
-            return training_graph(builder, state, acceleration, None if self.stress is None else stress, self.about)
-        dt, where = builder.metadata.frame_dt, state.periodicity
-        vel = integrators.velocities(self.truth[step : step + 2], dt, where)[0]
-        if step:  # the velocity noise of the start is removed entirely
-            before = integrators.velocities(self.truth[step - 1 : step + 1], dt, where)[0]
-            vel = vel + (1 - self.velocity_correction) * (state.vel - before)
-        deviation = integrators.velocities(torch.stack([self.truth[step], state.pos]), dt, where)[0]
-        target = integrators.acceleration(vel - self.position_correction * deviation, state.vel, dt) - state.gravity
-        return training_graph(builder, state, target, None if self.stress is None else self.stress[step], self.about)
-
-
-@dataclass(frozen=True)
-class Unroll:
-    """The start of an unroll with gradients, and the positions that it should reach.
-
-    Attributes:
-        graph: training graph of the initial state.
-        state: initial state with noise, as float64 tensors.
-        reference: positions [num_steps, node, dim] in m that the state should have after each step: the true ones, plus the part of the noise on the last
-            position that the targets have not removed (see ``Noise.correction``).
-        stress: true Cauchy stress [num_steps, node, component] in Pa after each step; None as in ``UnrollStart``.
-        about: attributes of the graphs, as in ``UnrollStart``.
-    """
-
-    graph: HeteroData
-    state: State
-    reference: Tensor
-    stress: Tensor | None
-    about: dict[str, Any]
-
-    @property
-    def num_steps(self) -> int:
-        """Number of steps of the unroll."""
-        return self.reference.shape[0]
-
-    def to(self, device: Any) -> Unroll:
-        """Return the same unroll on another device."""
-        stress = None if self.stress is None else self.stress.to(device)
-        return Unroll(self.graph.to(device), self.state.to_torch(device), self.reference.to(device), stress, self.about)
-
-    def graph_after(self, builder: GraphBuilder, state: State, step: int) -> HeteroData:
-        """Create the training graph of the state after ``step`` steps.
-
-        The target is the acceleration that leads to the next reference position. Gradients of the loss pass through the target to the state, too.
-
-        Raises:
-            SimulationError: as ``GraphBuilder.topology``.
-        """
-        dt = builder.metadata.frame_dt
-        vel = integrators.velocities(torch.stack([state.pos, self.reference[step]]), dt, state.periodicity)[0]
-        target = integrators.acceleration(vel, state.vel, dt) - state.gravity
-        return training_graph(builder, state, target, None if self.stress is None else self.stress[step], self.about)
-
-
-def training_graph(builder: GraphBuilder, state: State, target: Tensor, stress: Tensor | None, about: dict[str, Any]) -> HeteroData:
-    """Create the graph of a state, with targets for each node in the stores of materials.
-
-    Args:
-        builder: builder of the graph.
-        state: state of the scene.
-        target: acceleration without gravity [node, dim] in m/s²; stored as ``target``.
-        stress: Cauchy stress after the step [node, component] in Pa; stored as ``stress_target``. None stores none.
-        about: further attributes of the graph.
-    """
-    data = builder(state)
-    for material in builder.spec.materials:
-        data[material].target = target.to(builder.precision)[data[material].node_id]
-    if stress is not None:
-        for material in builder.spec.stress_channels:
-            data[material].stress_target = stress.to(builder.precision)[data[material].node_id]
-    for name, value in about.items():
-        data[name] = value
-    return data
 
 
 Samples: TypeAlias = HeteroData | list[UnrollStart] | list[Unroll]

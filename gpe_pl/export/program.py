@@ -29,6 +29,7 @@ from torch.export import Dim
 from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.graphs.features import history_of
 from gpe_pl.graphs.topology import IslandTopology, MeshTopology, Topology, descent_of
+from gpe_pl.learned.next_states import accelerations
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.nn.elastic_bodies import CellError
 from gpe_pl.rollout.skips import Skips
@@ -84,7 +85,7 @@ class ExportedStep(nn.Module):
         simulator, state, topology = self.simulator, self.state(scene), self.topology(scene)
         graph = simulator.builder.graph(topology, state)
         predicted = simulator(graph)
-        (acc,) = simulator.accelerations([state], [graph], predicted.acceleration)
+        (acc,) = accelerations([state], [topology.rows], predicted.acceleration, simulator.acceleration_std)
         new = simulator.integrated(state, graph, acc)
         moved: Scene = {}
         further: Scene = {}

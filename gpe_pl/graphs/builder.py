@@ -9,7 +9,7 @@ if it were missing. Each undirected edge is stored once. There are no edges betw
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
-from gpe_pl.graphs import compiled_graph
+from gpe_pl.graphs import compiled_graph, joined
+from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.compiled_graph import CompiledGraph
 from gpe_pl.graphs.elastic_cells import add_cells
 from gpe_pl.graphs.features import (
@@ -133,6 +134,13 @@ class GraphBuilder:
             )
         return find_topology(state, points, rows, self.config, self.spec, self.scales, self.skips)
 
+    def topology_or_error(self, state: State) -> Topology | SimulationError:
+        """Return the topology of a state, or the error if its graph cannot be built."""
+        try:
+            return self.topology(state)
+        except SimulationError as error:
+            return error
+
     def _checked(self, state: State) -> Points:
         """Check that a state fits the data set and can have a graph; return its positions."""
         if state.pos.dtype != torch.float64:
@@ -160,10 +168,16 @@ class GraphBuilder:
 
     # --- features of indices and state; torch.export traces what follows, so lengths are symbols and no branch depends on values ---------------
 
-    def graph(self, topology: Topology, state: State) -> HeteroData:
-        """Return the graph of a state whose topology is known."""
-        if compiled_graph.works_on(state) and (topology.mesh is None or topology.mesh.edges is not None):
-            return self._with_cells(self._compiled(self._raw)(topology, state), topology, state)
+    def graph(self, topology: Topology, state: State, standards: Standards | None = None) -> HeteroData:
+        """Return the graph of a state whose topology is known.
+
+        Args:
+            topology: topology of the state.
+            state: state of float64 tensors; with ``standards``, it must satisfy ``compiled_graph.works_on``.
+            standards: statistics with which features are standardised; None leaves them as they are.
+        """
+        if standards is not None or (compiled_graph.works_on(state) and (topology.mesh is None or topology.mesh.edges is not None)):
+            return self._with_cells(self._compiled(standards or self._raw)(topology, state), topology, state)
         data, history, boundary = HeteroData(), history_of(state), state.boundary
         for material, r in topology.rows.items():
             store = data[material]
@@ -206,14 +220,17 @@ class GraphBuilder:
             add_cells(data, topology, state, self.spec, self.scales, self.precision)
         return data
 
-    def standardized(self, state: State, standards: Standards) -> HeteroData:
-        """Return the graph of a state with standardised features. The state must satisfy ``compiled_graph.works_on``.
+    def batch(self, topologies: Sequence[Topology], states: Sequence[State], standards: Standards | None = None) -> HeteroData:
+        """Return ``batching.batched`` of the graphs of several states. One pass computes the features of all scenes where ``joined.covers`` them.
 
-        Raises:
-            GraphError, MeshError, SimulationError: as ``topology``.
+        Args:
+            topologies: topologies of the states.
+            states: the states; each is as in ``graph``.
+            standards: as in ``graph``.
         """
-        topology = self.topology(state)
-        return self._with_cells(self._compiled(standards)(topology, state), topology, state)
+        if joined.covers(topologies, states, self.spec):
+            return joined.joined_graph(self._compiled(standards or self._raw), topologies, states)
+        return batched([self.graph(topology, state, standards) for topology, state in zip(topologies, states, strict=True)])
 
     def _compiled(self, standards: Standards) -> CompiledGraph:
         return CompiledGraph(self.config, self.metadata, self.spec, self.scales, standards)

@@ -20,24 +20,26 @@ ROUNDED_TO_ZERO = 1e-9
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def motion(history, rows, gravity, level, velocity_unit, acceleration_unit, mean, inverse, out):
+def motion(history, rows, gravity, starts, level, velocity_unit, acceleration_unit, mean, inverse, out):
     """Write ``features.material_features`` of nodes to ``out`` [row, channel], or ``features.virtual_features`` if ``level`` [row] is not empty.
 
-    ``history`` has the velocities of nodes [node, history, dim] in m/s, and ``rows`` the nodes of each row of ``out``.
+    ``history`` has the velocities of nodes [node, history, dim] in m/s, and ``rows`` the nodes of each row of ``out``. ``gravity`` [scene, dim] acts on the
+    rows of a scene, which begin at ``starts`` [scene + 1].
     """
     num_steps, dim = history.shape[1], history.shape[2]
     per_velocity = 1 / velocity_unit
-    for k in range(rows.shape[0]):
-        n = rows[k]
-        for a in range(dim):
-            out[k, a] = history[n, num_steps - 1, a] * per_velocity
-            for s in range(1, num_steps):
-                out[k, s * dim + a] = (history[n, num_steps - s, a] - history[n, num_steps - s - 1, a]) * per_velocity
-            out[k, num_steps * dim + a] = gravity[a] / acceleration_unit
-        if level.shape[0] > 0:
-            out[k, (num_steps + 1) * dim] = level[k]
-        for c in range(out.shape[1]):
-            out[k, c] = (out[k, c] - mean[c]) * inverse[c]
+    for scene in range(gravity.shape[0]):
+        for k in range(starts[scene], starts[scene + 1]):
+            n = rows[k]
+            for a in range(dim):
+                out[k, a] = history[n, num_steps - 1, a] * per_velocity
+                for s in range(1, num_steps):
+                    out[k, s * dim + a] = (history[n, num_steps - s, a] - history[n, num_steps - s - 1, a]) * per_velocity
+                out[k, num_steps * dim + a] = gravity[scene, a] / acceleration_unit
+            if level.shape[0] > 0:
+                out[k, (num_steps + 1) * dim] = level[k]
+            for c in range(out.shape[1]):
+                out[k, c] = (out[k, c] - mean[c]) * inverse[c]
 
 
 @njit(cache=True, error_model="numpy")

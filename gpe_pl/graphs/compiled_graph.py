@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,6 +25,18 @@ NO_ROWS = np.empty((0, 0))
 NO_LEVEL = np.empty(0)
 
 
+class Scenes(NamedTuple):
+    """The scenes of a state that joins several.
+
+    Attributes:
+        gravity: gravity of each scene [scene, dim] in m/s².
+        starts: first row of each scene in the store of each material, and the number of rows [scene + 1].
+    """
+
+    gravity: np.ndarray
+    starts: Mapping[str, np.ndarray]
+
+
 def works_on(state: State) -> bool:
     """Tell whether the compiled features can process a state of tensors in the present context."""
     if state.pos.device.type != "cpu" or torch.compiler.is_compiling() or not is_wanted():
@@ -35,7 +48,7 @@ def works_on(state: State) -> bool:
 
 
 class CompiledGraph:
-    """Assembles the graph of one state.
+    """Assembles the graph of one state, which may join several scenes.
 
     Args:
         config: settings of the graph.
@@ -49,20 +62,21 @@ class CompiledGraph:
         self.config, self.metadata, self.spec, self.scales = config, metadata, spec, scales
         self.standards, self.precision = standards, standards.precision
 
-    def __call__(self, topology: Topology, state: State) -> HeteroData:
-        """Return the graph of a state whose topology is known."""
+    def __call__(self, topology: Topology, state: State, scenes: Scenes | None = None) -> HeteroData:
+        """Return the graph of a state whose topology is known. Without ``scenes``, it is one scene."""
         spec = self.spec
-        pos, history, gravity, mass = (_array(x) for x in (state.pos, history_of(state), state.gravity, state.mass))
+        pos, history, mass = (_array(x) for x in (state.pos, history_of(state), state.mass))
         boundary = state.boundary
         rows = {m: r.numpy() for m, r in topology.rows.items()}
-        stores: dict[str, dict[str, Any]] = {m: self._material(m, topology.rows[m], history, gravity, mass, state) for m in rows}
+        scenes = scenes or Scenes(_array(state.gravity)[None], {m: np.array([0, len(r)]) for m, r in rows.items()})
+        stores: dict[str, dict[str, Any]] = {m: self._material(m, topology.rows[m], history, scenes, mass, state) for m in rows}
         rows[BOUNDARY] = np.arange(boundary.pos.shape[0]) if topology.boundary_rows is None else topology.boundary_rows.numpy()
         stores[BOUNDARY] = {"x": self._walls(boundary, rows[BOUNDARY])}
         edges = self._contacts(topology, state, rows)
         for level in range(1, spec.num_levels + 1):
             stores[grid(level)] = {"x": self._empty(spec.node_channels[grid(level)])}
         if topology.mesh is not None:
-            virtual, of_mesh = self._mesh(topology, topology.mesh, pos, history, mass, gravity)
+            virtual, of_mesh = self._mesh(topology, topology.mesh, pos, history, mass, scenes.gravity)
             edges |= of_mesh
             for level, x in enumerate(virtual, start=1):
                 stores[grid(level)]["x"] = x
@@ -86,12 +100,11 @@ class CompiledGraph:
         store = {"edge_index": torch.empty(2, 0, dtype=torch.int64), "odd": odd, "even": self._empty(self.spec.even_channels[relation])}
         return store | {"offset": odd[:, : self.spec.dim]} if relation[1] == RADIUS else store
 
-    def _material(
-        self, material: str, rows: Tensor, history: np.ndarray, gravity: np.ndarray, mass: np.ndarray, state: State
-    ) -> dict[str, Any]:
+    def _material(self, material: str, rows: Tensor, history: np.ndarray, scenes: Scenes, mass: np.ndarray, state: State) -> dict[str, Any]:
         r, scales = rows.numpy(), self.scales
         x = self._new(len(r), self.spec.node_channels[material])
-        compiled_features.motion(history, r, gravity, NO_LEVEL, scales.velocity, scales.acceleration, *self.standards.node[material], x)
+        units, statistics = (scales.velocity, scales.acceleration), self.standards.node[material]
+        compiled_features.motion(history, r, scenes.gravity, scenes.starts[material], NO_LEVEL, *units, *statistics, x)
         params = self.standards.of_params(material, _array(state.material_params)[r][:, self.metadata.columns_of(material)])
         unit = self.precision.type(self.standards.mass)
         return {
@@ -146,7 +159,8 @@ class CompiledGraph:
         if sizes:
             level = np.repeat(np.arange(1.0, len(sizes) + 1), sizes)
             rows, statistics = np.arange(len(past)), self.standards.node[grid(1)]
-            compiled_features.motion(past, rows, gravity, level, scales.velocity, scales.acceleration, *statistics, x)
+            starts = np.array([0, len(past)])
+            compiled_features.motion(past, rows, gravity, starts, level, scales.velocity, scales.acceleration, *statistics, x)
         relations, counts, num_kinds = mesh.edges.relations, mesh.edges.counts, mesh.edges.num_cell_relations
         total, along_cells = sum(counts), sum(counts[:num_kinds])
         odd, cell_even = self._new(total, spec.odd_channels[relations[0]]), self._new(along_cells, spec.even_channels[relations[0]])

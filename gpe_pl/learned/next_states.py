@@ -1,12 +1,12 @@
 """Computes the next states of scenes, with stresses, from the predictions of a model for a batch of their graphs.
 
-On the CPU and without gradients, NumPy and compiled loops replace ``LearnedSimulator.accelerations`` and ``advance``, because for the small arrays of a scene
+On the CPU and without gradients, NumPy and compiled loops replace ``accelerations`` and ``LearnedSimulator.advance``, because for the small arrays of a scene
 most of the time of a PyTorch operation is its overhead.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import no_type_check
 
@@ -17,9 +17,13 @@ from torch import Tensor
 from torch_geometric.data import HeteroData
 
 from gpe_pl.graphs.compiled_graph import works_on
+from gpe_pl.nn.stores import contents
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.state import State, Stress
+
+Rows = Mapping[str, Tensor]
+"""Rows of the nodes of each material in a state."""
 
 
 def works_on_all(states: list[State], predicted: dict[str, Tensor]) -> bool:
@@ -27,19 +31,19 @@ def works_on_all(states: list[State], predicted: dict[str, Tensor]) -> bool:
     return all(map(works_on, states)) and not any(values.requires_grad for values in predicted.values())
 
 
-def moved(states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor], unit: float, dt: float) -> list[State]:
+def moved(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor], unit: float, dt: float) -> list[State]:
     """Return the states one frame later, given the accelerations that a model predicts.
 
     Args:
         states: states of the scenes of a batch.
-        graphs: their graphs.
+        rows: rows of the nodes of each material in each state.
         predicted: accelerations without gravity for the batch, by material.
         unit: unit of these accelerations [m/s²].
         dt: frame interval [s].
     """
     acc = [np.tile(state.gravity.numpy(), (state.num_nodes, 1)) for state in states]
-    for scene, rows, part in per_scene(predicted, graphs):
-        _add(part.contiguous().numpy(), rows.numpy(), unit, acc[scene])
+    for scene, own, part in per_scene(predicted, rows):
+        _add(part.contiguous().numpy(), own.numpy(), unit, acc[scene])
     new = []
     for state, a in zip(states, acc, strict=True):
         pos, vel = integrators.advance(state.pos.numpy(), state.vel.numpy(), a, dt)
@@ -51,40 +55,48 @@ def moved(states: list[State], graphs: list[HeteroData], predicted: dict[str, Te
     return new
 
 
-def with_frame_velocity(states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor], dt: float) -> list[State]:
+def accelerations(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor], unit: Tensor) -> list[Tensor]:
+    """Return the accelerations [node, dim] of each state in m/s², including gravity; arguments as in ``moved``."""
+    acc = [state.gravity.expand_as(state.pos).clone() for state in states]
+    for scene, own, part in per_scene(predicted, rows):
+        acc[scene][own] += part.double() * unit
+    return acc
+
+
+def with_frame_velocity(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor], dt: float) -> list[State]:
     """Return states with the field ``frame_velocity``, if a model predicts velocities at the frame. Nodes without a prediction get their mean velocity.
 
     Args:
         states: the states one frame later, as ``moved`` returns them.
-        graphs: their graphs.
+        rows: rows of the nodes of each material in each state.
         predicted: velocities at the frame for the batch, by material [node, dim] in m/frame.
         dt: frame interval [s].
     """
     if not predicted:
         return states
     at_frame = [state.vel.clone() for state in states]
-    for scene, rows, part in per_scene(predicted, graphs):
-        at_frame[scene] = at_frame[scene].index_copy(0, rows, part.double() / dt)
+    for scene, own, part in per_scene(predicted, rows):
+        at_frame[scene] = at_frame[scene].index_copy(0, own, part.double() / dt)
     return [replace(state, frame_velocity=velocity) for state, velocity in zip(states, at_frame, strict=True)]
 
 
-def with_stress(states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor], unit: Tensor, components: int) -> list[State]:
+def with_stress(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor], unit: Tensor, components: int) -> list[State]:
     """Return states with the stresses that a model predicts. States without cells are returned unchanged.
 
     Args:
         states: the states one frame later, as ``moved`` returns them.
-        graphs: their graphs.
+        rows: rows of the nodes of each material in each state.
         predicted: stresses for the batch, by material [node, component].
         unit: unit of these stresses [Pa].
         components: number of components of a stress.
     """
     node = [state.pos.new_zeros(state.num_nodes, components) for state in states]
     compiled = works_on_all(states, predicted)
-    for scene, rows, part in per_scene(predicted, graphs):
+    for scene, own, part in per_scene(predicted, rows):
         if compiled:
-            _add(part.contiguous().numpy(), rows.numpy(), float(unit), node[scene].numpy())
+            _add(part.contiguous().numpy(), own.numpy(), float(unit), node[scene].numpy())
         else:
-            node[scene][rows] = part.double() * unit
+            node[scene][own] = part.double() * unit
     means = _mean_over_corners if compiled else mean_over_corners
     return [
         state if state.cells is None else replace(state, stress=Stress(n, means(n, state.cells)))
@@ -92,15 +104,20 @@ def with_stress(states: list[State], graphs: list[HeteroData], predicted: dict[s
     ]
 
 
-def per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterator[tuple[int, Tensor, Tensor]]:
+def rows_of(graph: HeteroData) -> Rows:
+    """Return the rows of the nodes of each material in the state of a graph."""
+    return {name: store["node_id"] for name, store in contents(graph)[0].items() if "node_id" in store}
+
+
+def per_scene(predicted: dict[str, Tensor], rows: Sequence[Rows]) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Yield the predictions for a batch, split by scene, as (number of the scene, rows of its state, values of these rows)."""
     for material, values in predicted.items():
-        rows = [graph[material].node_id for graph in graphs]
-        if len(rows) == 1:
-            yield 0, rows[0], values
+        own = [of_scene[material] for of_scene in rows]
+        if len(own) == 1:
+            yield 0, own[0], values
             continue
-        for scene, part in enumerate(values.split([r.shape[0] for r in rows])):
-            yield scene, rows[scene], part
+        for scene, part in enumerate(values.split([r.shape[0] for r in own])):
+            yield scene, own[scene], part
 
 
 @njit(cache=True, error_model="numpy")

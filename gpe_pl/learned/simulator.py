@@ -11,7 +11,7 @@ import io
 import json
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -30,10 +30,11 @@ from gpe_pl.graphs.compiled_graph import works_on
 from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
 from gpe_pl.graphs.standards import Standards
+from gpe_pl.graphs.topology import Topology
 from gpe_pl.learned import next_states
 from gpe_pl.learned.checkpoint_file import CheckpointError as CheckpointError
 from gpe_pl.learned.checkpoint_file import load_checkpoint, reason
-from gpe_pl.learned.next_states import per_scene
+from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.pretrained import checkpoint_path
 from gpe_pl.learned.training_ranges import outside_masses, outside_parameters, stored_ranges
 from gpe_pl.models.base import Model, Prediction
@@ -373,7 +374,7 @@ class LearnedSimulator(nn.Module):
     @torch.inference_mode()
     def step(self, state: State) -> State:
         standards = self._standards([state])
-        return self._advance_all([state], [self._graph(state, standards)], standards is not None)[0]
+        return self._advance_all([state], [self.builder.topology(state)], standards)[0]
 
     @torch.inference_mode()
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
@@ -381,74 +382,68 @@ class LearnedSimulator(nn.Module):
         return self.next_states(states)
 
     def next_states(self, states: list[State]) -> list[State | SimulationError]:
-        """Do the same as ``step_all`` outside inference mode, so that autograd can use the results in training."""
-        standards = self._standards(states)
-        graphs = [self._graph_or_error(state, standards) for state in states]
-        sound = [k for k, graph in enumerate(graphs) if not isinstance(graph, SimulationError)]
-        new: list[Any] = list(graphs)
+        """Do the same as ``step_all`` outside inference mode, so that autograd can use the results in training.
+
+        States may be on the host while the model is on another device.
+        """
+        new: list[Any] = [self.builder.topology_or_error(state) for state in states]
+        sound = [k for k, topology in enumerate(new) if not isinstance(topology, SimulationError)]
         if sound:
-            advanced = self._advance_all([states[k] for k in sound], [new[k] for k in sound], standards is not None)
-            for k, state in zip(sound, advanced, strict=True):
+            kept = [states[k] for k in sound]
+            for k, state in zip(sound, self._advance_all(kept, [new[k] for k in sound], self._standards(kept)), strict=True):
                 new[k] = state
         return new
 
     def _standards(self, states: list[State]) -> Standards | None:
         """Return the statistics with which compiled features of these states are standardised; None if features have to be standardised afterwards."""
-        if self.standardizer.mass.dtype != self.builder.precision or not all(map(works_on, states)):
+        mass = self.standardizer.mass
+        if mass.is_cuda or mass.dtype != self.builder.precision or not all(map(works_on, states)):
             return None
         if self.static_friction and any(bool(state.boundary.vel.any()) for state in states):
             return None  # static friction reads from the graph which walls move
         return self.standardizer.standards(dict(self.trained_ranges()) if self.clamps_parameters else None)
 
-    def _graph(self, state: State, standards: Standards | None) -> HeteroData:
-        return self.builder(state) if standards is None else self.builder.standardized(state, standards)
-
-    def _graph_or_error(self, state: State, standards: Standards | None) -> HeteroData | SimulationError:
-        try:
-            return self._graph(state, standards)
-        except SimulationError as error:
-            return error
-
-    def _warn_of_unknown(self, graphs: list[HeteroData]) -> None:
-        """Warn, once each, of node types and relations of a scene that have no statistics from training."""
+    def _warn_of_unknown(self, graph: HeteroData) -> None:
+        """Warn, once each, of node types and relations of scenes that have no statistics from training."""
         if self._unknown is None:
             self._unknown = self.standardizer.unknown()
         for kind in [*self._unknown]:
-            if any(len(graph[kind].x if isinstance(kind, str) else graph[kind].odd) for graph in graphs):
+            if len(graph[kind].x if isinstance(kind, str) else graph[kind].odd):
                 log.warning("outside the training data: %s has no statistics; its features are not standardised", named(kind))
                 self._unknown.remove(kind)
 
-    def _advance_all(self, states: list[State], graphs: list[HeteroData], is_standardized: bool) -> list[State]:
-        self._warn_of_unknown(graphs)
-        data = graphs[0] if len(graphs) == 1 else batched(graphs)
-        predicted = self.model(data) if is_standardized else self(data)
-        new = self.moved(states, graphs, predicted, walls_rest=is_standardized)
-        return self._with_stress(new, graphs, predicted.stress) if predicted.stress else new
+    def _advance_all(self, states: list[State], topologies: list[Topology], standards: Standards | None) -> list[State]:
+        builder, rows, graphs = self.builder, [t.rows for t in topologies], list[HeteroData]()
+        if self.static_friction or len(states) == 1:
+            graphs = [builder.graph(topology, state, standards) for topology, state in zip(topologies, states, strict=True)]
+            data = graphs[0] if len(graphs) == 1 else batched(graphs)
+        else:
+            data = builder.batch(topologies, states, standards)
+        self._warn_of_unknown(data)
+        data = data.to(self.acceleration_std.device) if self.acceleration_std.device != states[0].pos.device else data
+        predicted = (self.model(data) if standards is not None else self(data)).to(states[0].pos.device)
+        new = self.later(states, rows, predicted)
+        if self.static_friction:
+            new = [self._with_static_friction(*parts, standards is not None) for parts in zip(states, new, graphs, strict=True)]
+        if not predicted.stress:
+            return new
+        components = next(iter(builder.spec.stress_channels.values()))
+        return next_states.with_stress(new, rows, predicted.stress, self.stress_std, components)
 
-    def moved(self, states: list[State], graphs: list[HeteroData], predicted: Prediction, walls_rest: bool = False) -> list[State]:
-        """Return the states one frame later, given the states, their graphs, and the model's prediction for their batch; ``walls_rest`` as in ``supported``."""
+    def moved(self, states: list[State], graphs: list[HeteroData], predicted: Prediction) -> list[State]:
+        """Return the states one frame later, given the states, their graphs, and the model's prediction for their batch."""
+        new = self.later(states, [*map(next_states.rows_of, graphs)], predicted)
+        return [self._with_static_friction(*parts) for parts in zip(states, new, graphs, strict=True)] if self.static_friction else new
+
+    def later(self, states: list[State], rows: Sequence[Rows], predicted: Prediction) -> list[State]:
+        """Do the same as ``moved`` without static friction, given the rows of the nodes of each material in each state."""
         acceleration, dt = predicted.acceleration, self.builder.metadata.frame_dt
         if not self.static_friction and next_states.works_on_all(states, acceleration):
-            new = next_states.moved(states, graphs, acceleration, float(self.acceleration_std), dt)
+            new = next_states.moved(states, rows, acceleration, float(self.acceleration_std), dt)
         else:
-            new = [self.advance(state, acc) for state, acc in zip(states, self.accelerations(states, graphs, acceleration), strict=True)]
-        new = next_states.with_frame_velocity(new, graphs, predicted.frame_velocity, dt)
-        if not self.static_friction:
-            return new
-        return [self._with_static_friction(*parts, walls_rest) for parts in zip(states, new, graphs, strict=True)]
-
-    def accelerations(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[Tensor]:
-        """Return the accelerations [node, dim] of each state in m/s², including gravity.
-
-        Args:
-            states: states of the scenes of a batch.
-            graphs: their graphs.
-            predicted: accelerations without gravity that the model predicts for the batch, per material, in units of ``acceleration_std``.
-        """
-        acc = [state.gravity.expand_as(state.pos).clone() for state in states]
-        for scene, rows, part in per_scene(predicted, graphs):
-            acc[scene][rows] += part.double() * self.acceleration_std
-        return acc
+            all_acc = next_states.accelerations(states, rows, acceleration, self.acceleration_std)
+            new = [self.advance(state, acc) for state, acc in zip(states, all_acc, strict=True)]
+        return next_states.with_frame_velocity(new, rows, predicted.frame_velocity, dt)
 
     def integrated(self, state: State, graph: HeteroData, acc: Tensor) -> State:
         """Return the next state under an acceleration [node, dim] in m/s² that includes gravity. Static friction keeps slow nodes in place."""
@@ -476,10 +471,6 @@ class LearnedSimulator(nn.Module):
         walls = [relation for relation in spec.relations if relation[0] == BOUNDARY]
         edges = [(graph[relation].edge_index, graph[relation[2]].island) for relation in walls]
         return supported(graph.island_is_free, [(island[i], moves[j]) for (j, i), island in edges])
-
-    def _with_stress(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[State]:
-        components = next(iter(self.builder.spec.stress_channels.values()))
-        return next_states.with_stress(states, graphs, predicted, self.stress_std, components)
 
     def advance(self, state: State, acc: Tensor) -> State:
         """Return the next state under an acceleration [node, dim] in m/s² that includes gravity, without static friction."""

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
@@ -25,6 +26,13 @@ class Prediction:
     acceleration: dict[str, Tensor]
     stress: dict[str, Tensor] = field(default_factory=dict)
     frame_velocity: dict[str, Tensor] = field(default_factory=dict)
+
+    def to(self, device: torch.device) -> "Prediction":
+        """Return the same prediction on a device."""
+        if all(values.device == device for values in self.acceleration.values()):
+            return self
+        parts = (self.acceleration, self.stress, self.frame_velocity)
+        return Prediction(*({m: values.to(device) for m, values in part.items()} for part in parts))
 
 
 class Model(nn.Module, ABC):

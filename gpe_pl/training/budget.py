@@ -22,7 +22,7 @@ import torch
 from filelock import FileLock
 from pydantic import Field, TypeAdapter, ValidationError
 
-from gpe_pl.data.dataset import Samples, WindowDataset, collated
+from gpe_pl.data.dataset import WindowDataset, collated
 from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
 from gpe_pl.files import sealed
@@ -114,7 +114,7 @@ def step_time(
     clock = time.perf_counter if on_gpu else time.process_time
     optimizer = OnePassAdam(module.parameters(), learning_rate=0.0)
     numbers = BatchSampler(data, size, 0, lambda: 0, push_forward)
-    batches = (_on(module.device, collated([data[key] for key in keys])) for keys in numbers)
+    batches = (module.transfer_batch_to_device(collated([data[key] for key in keys]), module.device, 0) for keys in numbers)
 
     def steps(count: int) -> float:
         start = clock()
@@ -133,10 +133,6 @@ def step_time(
         while len(rounds) < ROUNDS and sum(rounds) < limit:
             rounds.append(steps(MEASURED_STEPS))
         return min(rounds) / MEASURED_STEPS
-
-
-def _on(device: torch.device, samples: Samples) -> Samples:
-    return [start.to(device) for start in samples] if isinstance(samples, list) else samples.to(device)
 
 
 def within_budget(

@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 from torch_geometric.data import HeteroData
 
-from gpe_pl.data.dataset import Samples, Unroll, UnrollStart
+from gpe_pl.data.dataset import Samples
+from gpe_pl.data.training_samples import Unroll, UnrollStart
 from gpe_pl.errors import GpeError
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE
@@ -178,7 +179,7 @@ class TrainingModule(L.LightningModule):
             unrolls = [sample for sample in samples if isinstance(sample, Unroll)]
             return self._mean_loss(predictions(self.simulator, unrolls), unrolls[0].num_steps)
         starts = [sample for sample in samples if isinstance(sample, UnrollStart)] if isinstance(samples, list) else []
-        batch = self._excursions.graphs(self.simulator, starts) if isinstance(samples, list) else samples
+        batch = self._excursions.graphs(self.simulator, starts).to(self.device) if isinstance(samples, list) else samples
         predicted = self.simulator(batch)
         if starts:
             self._excursions.move_on(self.simulator, starts[0].lane, predicted)
@@ -239,6 +240,12 @@ class TrainingModule(L.LightningModule):
             return [1.0] * len(errors)
         here = torch.tensor([sum(e.numel() for e in kind) for kind in errors], device=self.device)
         return [n / max(1, total) for n, total in zip(here.tolist(), ranks.summed(here).tolist(), strict=True)]
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """Move a batch to the device. Starts of push-forward stay on the CPU, where their unrolls are advanced."""
+        if isinstance(batch, list) and isinstance(batch[0], UnrollStart):
+            return batch
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor | None:
         """Return the loss of a batch. If the loss is not finite, the step changes nothing; a run of one process then returns None."""

@@ -1,7 +1,8 @@
 """Push-forward: trains a simulator on states that its own unrolls reach.
 
 A training step uses the prediction of the model twice: for the loss, and to advance the unrolled states by one step. Unrolls therefore need no additional pass
-of the model. The advanced states are kept until the next training step of their lane.
+of the model. The advanced states are kept until the next training step of their lane. States are on the CPU, also if the model is on another device: the search
+for neighbours runs there, and a batch of graphs reaches the device in a few copies.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
-from gpe_pl.data.dataset import UnrollStart
-from gpe_pl.graphs.batching import batched
+from gpe_pl.data.training_samples import UnrollStart, training_batch
+from gpe_pl.graphs.topology import Topology
 from gpe_pl.learned.approximate import Batched
+from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.base import Prediction
 from gpe_pl.rollout.loop import SimulationError, step_scenes
@@ -35,13 +37,13 @@ class Excursion:
         samples: number of each scene's sample in the data set.
         states: state that each unroll has reached.
         steps: number of steps that each unroll has made.
-        graphs: graphs of ``states``; empty between ``move_on`` and the next call of ``graphs``.
+        rows: rows of the nodes of each material in ``states``; empty between ``move_on`` and the next call of ``graphs``.
     """
 
     samples: list[int]
     states: list[State]
     steps: list[int]
-    graphs: list[HeteroData]
+    rows: list[Rows]
 
 
 Stored = dict[int, dict[int, dict[str, Any]]]
@@ -80,7 +82,7 @@ class Excursions:
         self._loaded = {lane: dict(scenes) for lane, scenes in stored.items()}
 
     def graphs(self, simulator: LearnedSimulator, starts: Sequence[UnrollStart]) -> HeteroData:
-        """Return a batch of graphs of the states that the unrolls of a lane have reached.
+        """Return a batch of graphs of the states that the unrolls of a lane have reached, on the CPU.
 
         If the lane has other samples than ``starts``, these replace them. The new unrolls continue from a loaded checkpoint, or are made first. A scene whose
         unroll failed or passed the last ground-truth frame restarts.
@@ -93,18 +95,20 @@ class Excursions:
         under_way = self._lanes.get(lane)
         if under_way is None or under_way.samples != samples:
             under_way = self._taken_up(lane, starts) or Excursion(samples, *unrolled(simulator, starts), [])
-        under_way.graphs = []
+        topologies = []
         for k, start in enumerate(starts):
             if start.state.boundary.motion is not None:  # this start's stretch of the motion may reach further than the last
                 boundary = start.state.boundary.at(under_way.steps[k])
                 under_way.states[k] = replace(under_way.states[k], boundary=boundary)
-            graph = _graph(simulator, start, under_way.states[k], under_way.steps[k])
-            if graph is None:
+            is_over = under_way.steps[k] > start.num_steps
+            found = None if is_over else simulator.builder.topology_or_error(under_way.states[k])
+            if not isinstance(found, Topology):
                 under_way.states[k], under_way.steps[k] = start.state, 0
-                graph = start.graph(simulator.builder, start.state, 0)
-            under_way.graphs.append(graph)
+                found = simulator.builder.topology(start.state)
+            topologies.append(found)
+        under_way.rows = [topology.rows for topology in topologies]
         self._lanes[lane] = under_way
-        return batched(under_way.graphs)
+        return training_batch(simulator.builder, topologies, under_way.states, starts, under_way.steps)
 
     def _taken_up(self, lane: int, starts: Sequence[UnrollStart]) -> Excursion | None:
         """Return a batch of these samples as a checkpoint stored it; None if the checkpoint does not have all of them."""
@@ -125,18 +129,9 @@ class Excursions:
             predicted: prediction for the lane's last ``graphs``.
         """
         under_way = self._lanes[lane]
-        under_way.states = simulator.moved(under_way.states, under_way.graphs, predicted)
+        under_way.states = simulator.later(under_way.states, under_way.rows, predicted.to(under_way.states[0].pos.device))
         under_way.steps = [step + 1 for step in under_way.steps]
-        under_way.graphs = []
-
-
-def _graph(simulator: LearnedSimulator, start: UnrollStart, state: State, step: int) -> HeteroData | None:
-    if step > start.num_steps:
-        return None
-    try:
-        return start.graph(simulator.builder, state, step)
-    except SimulationError:
-        return None
+        under_way.rows = []
 
 
 def _moved(start: State, scene: dict[str, Any]) -> State:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 
 from torch_geometric.data import HeteroData
 
-from gpe_pl.data.dataset import Unroll
+from gpe_pl.data.training_samples import Unroll
 from gpe_pl.graphs.batching import batched
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.base import Prediction

@@ -12,7 +12,8 @@ import torch
 
 from gpe_pl.geometry.periodicity import Periodicity
 from gpe_pl.geometry.shapes import Box, domain_walls
-from gpe_pl.graphs import compiled_graph
+from gpe_pl.graphs import compiled_graph, joined
+from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.compiled_graph import works_on
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -188,6 +189,33 @@ def simulator(build: GraphBuilder, s: State, clamps: bool = True, **settings: An
     return made
 
 
+def another(s: State) -> State:
+    """Return some of the nodes of a state, under other gravity and with fewer walls."""
+    rest, b = s.take(np.arange(2 * s.num_nodes // 3)), s.boundary
+    walls = {name: getattr(b, name)[::2] for name in ("pos", "vel", "normal", "friction", "restitution")}
+    return replace(rest, gravity=1.5 * s.gravity[::-1], boundary=Boundary(**walls))
+
+
+@pytest.mark.parametrize("is_standardized", [False, True])
+@pytest.mark.parametrize("scene", [name for name in SCENES if "cells " not in name and name != "cells"])
+def test_batches_in_one_pass_are_the_joined_graphs(scene: str, is_standardized: bool) -> None:
+    build, s = SCENES[scene]()
+    states = [s.to_torch(), another(s).to_torch(), s.take(np.arange(min(2, s.num_nodes))).to_torch()]
+    standards = simulator(build, states[0]).standardizer.standards() if is_standardized else None
+    topologies = [build.topology(state) for state in states]
+    assert joined.covers(topologies, states, build.spec) is all(t.mesh is None for t in topologies)
+    expected = batched([build.graph(*pair, standards) for pair in zip(topologies, states, strict=True)])
+    scenes.assert_equal_graphs(build.batch(topologies, states, standards), expected)
+
+
+def test_scenes_with_walls_at_rest_and_moving_walls_are_joined() -> None:
+    build, s = moving_walls()
+    states = [s.to_torch(), particles()[1].to_torch()]
+    topologies = [build.topology(state) for state in states]
+    expected = batched([build.graph(*pair) for pair in zip(topologies, states, strict=True)])
+    scenes.assert_equal_graphs(build.batch(topologies, states), expected)
+
+
 @pytest.mark.parametrize("clamps", [True, False])
 @pytest.mark.parametrize("scene", ["materials", "one of several materials", "bodies in contact", "further parameters", "paper mesh"])
 def test_standardized_graphs_equal_plain_ones_that_are_standardised(scene: str, clamps: bool) -> None:
@@ -198,18 +226,23 @@ def test_standardized_graphs_equal_plain_ones_that_are_standardised(scene: str, 
     assert standards is not None
     with unfused():
         plain = made.standardizer(build(s), True, dict(made.trained_ranges()) if clamps else None)
-    scenes.assert_equal_graphs(build.standardized(s, standards), plain, rtol=1e-5, atol=1e-5)
+    scenes.assert_equal_graphs(build.graph(build.topology(s), s, standards), plain, rtol=1e-5, atol=1e-5)
 
 
 def test_changed_statistics_are_seen() -> None:
     build, s = particles()
     made = simulator(build, s.to_torch())
     sand: Any = made.standardizer.node["sand"]
-    x = [build.standardized(s.to_torch(), made.standardizer.standards())["sand"].x]
+
+    def standardized() -> torch.Tensor:
+        state = s.to_torch()
+        return build.graph(build.topology(state), state, made.standardizer.standards())["sand"].x
+
+    x = [standardized()]
     sand.mean += 1.0
-    x.append(build.standardized(s.to_torch(), made.standardizer.standards())["sand"].x)
+    x.append(standardized())
     made.double()
-    x.append(build.standardized(s.to_torch(), made.standardizer.standards())["sand"].x)
+    x.append(standardized())
     torch.testing.assert_close(x[1], x[0] - (1 / sand.std).float())
     assert x[2].dtype == torch.float64
     torch.testing.assert_close(x[2].float(), x[1])

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gpe_pl.config.datasets import dataset
-from gpe_pl.data.dataset import Samples, StartKey, StoredTrajectory, WindowDataset, collated
+from gpe_pl.data.dataset import StartKey, StoredTrajectory, WindowDataset, collated
 from gpe_pl.data.ground_truth import generate_trajectory
 from gpe_pl.data.noise import Noise
 from gpe_pl.graphs.builder import GraphBuilder
@@ -47,17 +47,14 @@ def module(trajectory: Trajectory, name: str) -> tuple[TrainingModule, WindowDat
     return TrainingModule(simulator, 100, compile="off"), windows
 
 
-def on(device: str, samples: Samples) -> Samples:
-    return [sample.to(device) for sample in samples] if isinstance(samples, list) else samples.to(device)
-
-
 @pytest.mark.parametrize("unrolls", [False, True])
 def test_losses_and_gradients_are_the_same(trajectory: Trajectory, unrolls: bool) -> None:
     found = {}
     for device in ("cpu", "cuda"):
         trained, windows = module(trajectory, trajectory.metadata.dataset)
         keys = [StartKey(k, k, 3) for k in WINDOWS] if unrolls else list(WINDOWS)
-        loss = trained.to(device).loss(on(device, collated([windows[key] for key in keys])))
+        samples = trained.to(device).transfer_batch_to_device(collated([windows[key] for key in keys]), torch.device(device), 0)
+        loss = trained.loss(samples)
         loss.backward()
         gradient = torch.cat([p.grad.flatten().cpu() for p in trained.parameters() if p.grad is not None])
         found[device] = float(loss.detach()), gradient

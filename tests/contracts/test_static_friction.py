@@ -13,6 +13,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.standards import Standards
+from gpe_pl.graphs.topology import Topology
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator, SceneError
 from gpe_pl.models.base import Prediction
 from gpe_pl.models.gpe import GPE
@@ -75,14 +76,14 @@ def test_features_are_compiled_unless_a_wall_moves(monkeypatch: pytest.MonkeyPat
     state, lies = lying_and_flying()
     learned = simulator()
     learned.static_friction = ENOUGH
-    standardized = GraphBuilder.standardized
+    graph = GraphBuilder.graph
     made: list[State] = []
 
-    def counted(build: GraphBuilder, state: State, standards: Standards) -> HeteroData:
-        made.append(state)
-        return standardized(build, state, standards)
+    def counted(build: GraphBuilder, topology: Topology, state: State, standards: Standards | None = None) -> HeteroData:
+        made.extend([state] if standards is not None else [])
+        return graph(build, topology, state, standards)
 
-    monkeypatch.setattr(GraphBuilder, "standardized", counted)
+    monkeypatch.setattr(GraphBuilder, "graph", counted)
     still = learned.step(state.to_torch())
     assert len(made) == 1 and torch.equal(still.pos[lies], state.to_torch().pos[lies])
     vel = np.zeros_like(state.boundary.vel)

@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from gpe_pl.config.datasets import dataset
-from gpe_pl.data.dataset import StartKey, StoredTrajectory, UnrollStart, WindowDataset
+from gpe_pl.data.dataset import StartKey, StoredTrajectory, WindowDataset
 from gpe_pl.data.ground_truth import generate_trajectory
 from gpe_pl.data.noise import Noise
+from gpe_pl.data.training_samples import UnrollStart
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.rollout.loop import Restartable

@@ -6,17 +6,19 @@ import copy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch_geometric.data import HeteroData
 
-from gpe_pl.data.dataset import StartKey, UnrollStart, WindowDataset, open_split
+from gpe_pl.data.dataset import StartKey, WindowDataset, open_split
 from gpe_pl.data.sampling import PushForward
+from gpe_pl.data.training_samples import UnrollStart
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.graphs.topology import Topology
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.loop import SimulationError
@@ -100,14 +102,14 @@ def test_at_the_end_of_the_truth_and_after_falling_apart_a_sample_is_at_its_star
 
     module._excursions.clear()
     module.loss(turns[0])
-    built = UnrollStart.graph
+    found = GraphBuilder.topology
 
-    def fails_under_way(self: UnrollStart, builder: GraphBuilder, state: State, step: int) -> HeteroData:
-        if step:
+    def fails_under_way(self: GraphBuilder, state: State) -> Topology:
+        if state.time > turns[0][0].state.time:
             raise SimulationError("no")
-        return built(self, builder, state, step)
+        return found(self, state)
 
-    monkeypatch.setattr(UnrollStart, "graph", fails_under_way)
+    monkeypatch.setattr(GraphBuilder, "topology", fails_under_way)
     assert_equal_graphs(module._excursions.graphs(simulator, turns[1]), usual)
 
 
@@ -149,12 +151,6 @@ def test_weights_of_graphs_weigh_their_nodes(data: WindowDataset, simulator: Lea
     assert float(module.loss(batched(graphs))) == pytest.approx(float(0.5 * losses[0] + 3.0 * losses[1]) / 2, rel=1e-5)
 
 
-def test_a_start_can_be_moved(data: WindowDataset) -> None:
-    start = data[StartKey(0, 0, 2)]
-    moved = start.to("cpu")
-    assert moved.num_steps == 2 and torch.equal(moved.truth, start.truth)
-
-
 def test_the_last_steps_are_unrolled() -> None:
     settings = TrainingSettings(num_steps=10, val_interval=5, push_steps=4)
     assert settings.push_forward is None
@@ -175,13 +171,13 @@ def test_walls_that_move_go_on_moving_on_the_way(
         LearnedSimulator(GPE(data.builder.spec, num_message_passing_steps=1, hidden_channels=8), data.builder), num_steps=10
     )
     seen: list[torch.Tensor] = []
-    plain = UnrollStart.graph
+    plain = UnrollStart.target
 
-    def graph(self: UnrollStart, builder: GraphBuilder, state: State, step: int) -> HeteroData:
+    def target(self: UnrollStart, state: State, step: int, dt: float) -> Any:
         seen.append(state.boundary.pos)
-        return plain(self, builder, state, step)
+        return plain(self, state, step, dt)
 
-    monkeypatch.setattr(UnrollStart, "graph", graph)
+    monkeypatch.setattr(UnrollStart, "target", target)
     for starts in visits(data, [(0, 0)], 0, 3):
         module.loss(starts)
     first = data.locate(0)[1]
