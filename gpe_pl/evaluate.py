@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 from gpe_pl.config.entry_point import ConfigError, construct, construct_target, entry_point
 from gpe_pl.config.folder import CONF
 from gpe_pl.errors import GpeError
+from gpe_pl.errors.printable import did_you_mean
+from gpe_pl.schema import SPLITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,7 +27,15 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
 
     A split that is missing is generated first. The first printed line says which acceptance checks and stress tests the model fails.
     """
-    from gpe_pl.config.datasets import check_material_controls, ensure_split, evaluated_config, material_controls, scene_metadata, stride_of
+    from gpe_pl.config.datasets import (
+        check_material_controls,
+        check_splits,
+        ensure_split,
+        evaluated_config,
+        material_controls,
+        scene_metadata,
+        stride_of,
+    )
     from gpe_pl.evaluation.rollouts import evaluate
     from gpe_pl.evaluation.settings import EvaluationSettings
     from gpe_pl.files.names import run_name
@@ -42,15 +52,18 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     if not isinstance(cfg.checkpoint, str):
         shipped = f", or a shipped model: {', '.join(names())}" if names() else ""
         raise ConfigError(f"checkpoint={cfg.checkpoint!r}: name the folder of a run, such as runs/sand, or a checkpoint{shipped}")
+    if cfg.split not in SPLITS:
+        raise ConfigError(f"split={cfg.split}: must be one of {', '.join(SPLITS)}{did_you_mean(str(cfg.split), SPLITS)}")
     if cfg.evaluation.data or list(cfg.evaluation.splits) != [cfg.split]:
         raise ConfigError("evaluation.data, evaluation.splits: are keys of fit; evaluate takes data=… and split=…, one split in each run")
     settings = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
+    evaluated = evaluated_config(cfg)
+    check_splits(evaluated, [cfg.split], "split")
     check_material_controls(cfg, settings)
     device = set_up(construct(TrainerSettings, cfg.trainer, "trainer"))
     simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint, device)
     simulator.skips = construct(Skips, cfg.rollout, "rollout")
     print(headline(cfg.checkpoint), flush=True)
-    evaluated = evaluated_config(cfg)
     scene = scene_metadata(evaluated, cfg.split)
     if not simulator.fits(scene):
         stride = simulator.stride_on(scene_metadata(evaluated, cfg.split, strided=False))

@@ -11,6 +11,8 @@ from gpe_pl.files.names import data_name
 from gpe_pl.schema import SPLITS
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from omegaconf import DictConfig
 
     from gpe_pl.data.ground_truth import DatasetSpec
@@ -164,6 +166,19 @@ def check_same_frames(trained: Metadata, evaluated: Metadata) -> None:
             f"evaluation.data: frames of {evaluated.frame_dt:g} s, those of the training have {trained.frame_dt:g} s; "
             "choose another evaluation.data.stride or evaluation.data.solver.frame_dt"
         )
+
+
+def check_splits(cfg: DictConfig, splits: Sequence[str], key: str) -> None:
+    """Raise ``ConfigError`` before any work is done if generated data will have no trajectory in one of these splits, which ``key`` named."""
+    if cfg.data.size == IMPORTED:
+        return
+    counts = dataset_spec(cfg).counts
+    for split in splits:
+        if not counts[split]:
+            there = ", ".join(name for name, count in counts.items() if count)
+            raise ConfigError(
+                f"{key}={split}: data={cfg.data.name} with size={cfg.size.name} has no such trajectories, only {there}; or set data.num_{split}"
+            )
 
 
 def check_material_controls(cfg: DictConfig, settings: EvaluationSettings) -> None:

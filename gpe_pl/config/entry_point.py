@@ -12,7 +12,6 @@ import importlib
 import json
 import math
 import os
-import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +22,6 @@ from typing import Any, TypeVar
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
@@ -31,11 +29,12 @@ from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 from pydantic import ValidationError
 
 from gpe_pl.config import plugins
+from gpe_pl.config.explanations import ConfigError, check_arguments, explain, groups, refusal, violations
 from gpe_pl.config.folder import CONF
 from gpe_pl.config.launcher import RESULT, USAGE_ERROR, SweepError, end_with_sweep
 from gpe_pl.config.typed_keys import without_effect
 from gpe_pl.errors import GpeError
-from gpe_pl.errors.printable import clean_messages, one_line, speak_utf8
+from gpe_pl.errors.printable import clean_messages, did_you_mean, one_line, speak_utf8
 from gpe_pl.files.atomic import replace_text, unnamed
 from gpe_pl.files.names import NameRefused, run_name, sweep_name
 from gpe_pl.files.run_folder import refuse_links
@@ -57,20 +56,12 @@ OmegaConf.register_new_resolver("fine_suffix", lambda fine: "" if fine == 1 else
 T = TypeVar("T")
 
 
-class ConfigError(GpeError, ValueError):
-    """Raised for a config value that is not allowed; the message names key, value and the allowed values."""
-
-
 def _refused(message: str) -> None:
     """Resolver ``${refused:"…"}`` for a value that other files in ``conf/`` have to replace."""
     raise ConfigError(message)
 
 
 OmegaConf.register_new_resolver("refused", _refused, replace=True)
-REFUSALS = (NameRefused.__name__, ConfigError.__name__)
-"""Errors that a ``${…}`` in a configuration can raise and whose message is complete. What OmegaConf adds to such a message is dropped."""
-
-
 _results: list[Path] = []
 """Results folders of this process, which ``Report`` adds."""
 
@@ -132,20 +123,20 @@ def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *late
     valid = parameters(target, *later)
     unknown = set(values) - set(valid)
     if unknown:
-        raise ConfigError(f"{path}.{min(unknown)}: unknown key; valid keys: {', '.join(valid)}")
+        raise ConfigError(f"{path}.{min(unknown)}: unknown key{did_you_mean(min(unknown), valid)}; valid keys: {', '.join(valid)}")
     for key, number in _integers(values, path):
         if abs(number) > LARGEST_INTEGER:
             raise ConfigError(f"{key}={number}: must be within ±{LARGEST_INTEGER}")
     try:
         arguments = checked(target, values, *later)
     except ValidationError as error:
-        raise ConfigError(_one_line(error, path)) from None
+        raise ConfigError(violations(error, path)) from None
 
     def call(**given: Any) -> T:
         try:
             return target(**arguments, **given)
         except ValidationError as error:  # from a class that checks combinations of its values
-            raise ConfigError(_one_line(error, path)) from None
+            raise ConfigError(violations(error, path)) from None
         except ValueError as error:
             if isinstance(error, GpeError):
                 raise
@@ -166,17 +157,6 @@ def _integers(value: Any, path: str) -> Iterator[tuple[str, int]]:
         yield path, value
 
 
-def _one_line(error: ValidationError, path: str) -> str:
-    parts = []
-    for e in error.errors():
-        key = ".".join([*([path] if path else []), *(str(k) for k in e["loc"] if isinstance(k, (str, int)))])
-        value = f"={e['input']!r}" if e["loc"] and e["type"] != "missing" and not isinstance(e["input"], dict) else ""
-        message = e["msg"].removeprefix("Value error, ")
-        message = message if message[:2].isupper() else message[0].lower() + message[1:]
-        parts.append(f"{key}{value}: {message}")
-    return "; ".join(dict.fromkeys(parts))
-
-
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], Any]]:
     """Create the main function of a command from a file in ``conf/``; a decorator like ``hydra.main``, with one-line errors.
 
@@ -195,9 +175,11 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             try:
                 if "dimension" in list(cfg) and cfg.dimension not in (2, 3):
                     raise ConfigError(f"dimension={cfg.dimension}: must be 2 or 3")
-                if unread := without_effect(cfg, HydraConfig.get().overrides.task):
+                typed = HydraConfig.get().overrides.task
+                if unread := without_effect(cfg, typed):
                     raise ConfigError(unread)
                 OmegaConf.resolve(cfg)
+                _check_device(cfg, typed)
                 construct(Paths, cfg.paths, "paths")
                 _check_top_level(cfg, config_name)
                 value = task(cfg)
@@ -216,8 +198,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             ) as error:  # OSError: full disks, folders that cannot be written, missing files
                 if verbose:
                     raise
-                if (refusal := _refusal(error)) is not None:
-                    _fail(ConfigError(refusal))
+                if (known := refusal(error)) is not None:
+                    _fail(ConfigError(known))
                 _fail(unnamed(error, _written(cfg.paths)) if isinstance(error, OSError) else error)
 
         def main() -> Any:
@@ -226,6 +208,10 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             early_interrupts.end()
             speak_utf8()
             clean_messages()
+            try:
+                check_arguments(sys.argv[1:], config_name)
+            except ConfigError as error:
+                _fail(error)
             sys.argv[1:] = [quoted(argument) for argument in sys.argv[1:]]
             os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach this function, without Hydra's report
             try:
@@ -295,71 +281,28 @@ def _fail(error: Exception) -> None:
     sys.exit(USAGE_ERROR if RESULT in os.environ and isinstance(error, (ConfigError, NameRefused)) else 2)
 
 
-def _refusal(error: Exception) -> str | None:
-    """Return the message of a resolver in ``REFUSALS`` without what OmegaConf adds to it; None for other errors."""
-    text = " ".join(str(error).split())
-    if any(f"{name} raised" in text for name in REFUSALS):
-        return re.sub(r"^.*? raised while resolving interpolation: | full_key: .*", "", text)
-    return None
+def _check_device(cfg: DictConfig, typed: Sequence[str]) -> None:
+    """Raise ``ConfigError`` before any work is done if there is no GPU for ``trainer=gpu``. The message names what was typed."""
+    if OmegaConf.select(cfg, "trainer.accelerator") != "gpu":
+        return
+    import torch
 
-
-def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
-    """Explain a composition error in one line, with the valid keys or choices."""
-    if (refusal := _refusal(error)) is not None:
-        return refusal
-    text = " ".join(str(error).split())
-    if "'data/imported'" in text:
-        return f"data=imported: {config_name} takes data that it simulates; fit and evaluate take imported ones"
-    match = re.search(r"Could not override '([^']+)'", text)
-    if match is None:
-        override = getattr(error, "override", None)  # syntax errors have it
-        text = re.sub(r" ?Config search path:.*| ?Set the environment variable.*| See https://.*", "", text)
-        text = f"{override}: {text}" if override and override not in text else text
-        return f"{text}; a value that holds = needs quotes: 'KEY=\"VALUE\"'" if override and override.count("=") > 1 else text
-    key = match.group(1).partition("@")[0].lstrip("+~")
-    parent, _, leaf = key.rpartition(".")
-    if key.startswith("hydra."):
-        return text
-    others = [
-        _first_choice(o) for o in overrides if "=" in o and not o.startswith(("-", "hydra")) and o.partition("=")[0].lstrip("+~") != key
-    ]
-    GlobalHydra.instance().clear()
-    try:
-        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-            node: Any = hydra.compose(config_name, others)
-            while parent and not isinstance(OmegaConf.select(node, parent), DictConfig):
-                parent = parent.rpartition(".")[0]  # the misspelt part is further up in the key
-                leaf = key.removeprefix(f"{parent}.").partition(".")[0]
-            node = OmegaConf.select(node, parent) if parent else node
-            keys = ", ".join(sorted({*map(str, node), *(() if parent else _groups(config_name))}))
-    except (HydraException, OmegaConfBaseException):
-        return text
-    return f"{key}: unknown key {leaf!r}; valid keys{f' of {parent}' if parent else ''}: {keys}"
+    if not torch.cuda.is_available():
+        key = next((override for override in typed if override.lstrip("+").startswith("trainer")), "trainer.accelerator=gpu")
+        raise ConfigError(f"{key}: PyTorch finds no GPU here; choose trainer=cpu, or install a PyTorch that supports your GPU")
 
 
 def _check_top_level(cfg: DictConfig, config_name: str) -> None:
     file = OmegaConf.load(CONF / f"{config_name}.yaml")
-    known = {*_groups(config_name), *map(str, file)} - {"defaults", "hydra"}
+    known = {*groups(config_name), *map(str, file)} - {"defaults", "hydra"}
     wrong = {str(k) for k in cfg} ^ (known - (WITHOUT_KEY - set(file)))
     if wrong:
-        raise ConfigError(f"{min(wrong)}: unknown or missing key; valid keys: {', '.join(sorted(known))}")
+        raise ConfigError(f"{min(wrong)}: unknown or missing key{did_you_mean(min(wrong), known)}; valid keys: {', '.join(sorted(known))}")
     if "name" in cfg and OmegaConf.to_container(file)["name"] is not None:  # type: ignore[call-overload,index]
         try:
             run_name(cfg.name)
         except NameRefused as error:
             raise ConfigError(str(error)) from None
-
-
-def _first_choice(override: str) -> str:
-    """Reduce a sweep override to the first of its values."""
-    parsed = OverridesParser.create().parse_override(override)
-    return f"{override.partition('=')[0]}={next(parsed.sweep_string_iterator())}" if parsed.is_sweep_override() else override
-
-
-def _groups(config_name: str) -> set[str]:
-    """Return the config groups of a command."""
-    defaults = OmegaConf.load(CONF / f"{config_name}.yaml").defaults
-    return {str(group) for entry in defaults if isinstance(entry, DictConfig) for group in entry if "/" not in str(group)}
 
 
 def output_dir(cfg: DictConfig) -> Path:

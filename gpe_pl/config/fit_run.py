@@ -13,6 +13,7 @@ from gpe_pl.config.datasets import (
     IMPORTED,
     check_material_controls,
     check_same_frames,
+    check_splits,
     dataset_spec,
     ensure_data,
     evaluated_config,
@@ -69,6 +70,7 @@ class FitRun:
         self.training = construct(TrainingSettings, cfg.training, "training")
         self.trainer = construct(TrainerSettings, cfg.trainer, "trainer")
         self.evaluation = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
+        check_splits(evaluated_config(cfg), self.evaluation.splits, "evaluation.splits")
         check_material_controls(cfg, self.evaluation)
         self.graph = construct(GraphConfig, cfg.graph, "graph")
         self.stride, self.evaluated_stride = stride_of(cfg), stride_of(evaluated_config(cfg))

@@ -79,5 +79,7 @@ def _print_traceback(kind: type[BaseException], error: BaseException, trace: Tra
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return ``; did you mean 'x'?`` with the known word that is most similar to one that is not known; an empty string if none is similar."""
-    close = difflib.get_close_matches(word.lower(), (by_lower := {str(each).lower(): str(each) for each in known}), n=1, cutoff=0.6)
+    by_lower = {str(each).lower(): str(each) for each in known}
+    swapped = [each for each in by_lower if sorted(each) == sorted(word.lower())]
+    close = swapped or difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.6)
     return f"; did you mean {by_lower[close[0]]!r}?" if close else ""

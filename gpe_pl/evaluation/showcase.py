@@ -257,10 +257,14 @@ class _Film:
 
 def table(records: list[Measurement], stopped: str | None) -> str:
     """Return a table in Markdown with one row per record, and the reason if the rollout stopped early."""
-    lines = ["| | value | unit |", "|---|---|---|", *(f"| {r.metric.replace('_', ' ')} | {r.value:.6g} | {r.unit} |" for r in records)]
+    lines = [
+        "| | value | unit |",
+        "|---|---|---|",
+        *(f"| {r.metric.replace('_', ' ')} | {r.value:.6g} | {'' if r.unit == '1' else r.unit} |" for r in records),
+    ]
     return "\n".join([*lines, *(["", f"Stopped: {stopped}"] if stopped else []), ""])
 
 
 def summary(records: list[Measurement]) -> str:
     """Return plain text with one line per record."""
-    return "\n".join(f"showcase  {r.metric:28} {r.value:12.6g} {r.unit}" for r in records)
+    return "\n".join(f"showcase  {r.metric:28} {r.value:12.6g} {'' if r.unit == '1' else r.unit}".rstrip() for r in records)

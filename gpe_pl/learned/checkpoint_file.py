@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from gpe_pl.errors import GpeError
+from gpe_pl.errors.printable import did_you_mean
 from gpe_pl.learned.checkpoint_archive import check_archive, check_values
 from gpe_pl.learned.pretrained import names
 
@@ -26,7 +27,9 @@ def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
     """
     if not Path(path).is_file():
         shipped = f", or a shipped model: {', '.join(names())}" if names() else ""
-        raise CheckpointError(f"{path}: no such checkpoint; give the folder of a run, the path of a checkpoint{shipped}")
+        raise CheckpointError(
+            f"{path}: no such checkpoint{did_you_mean(str(path), names())}; give the folder of a run, the path of a checkpoint{shipped}"
+        )
     try:
         check_archive(Path(path))
         values = torch.load(path, map_location=device, weights_only=True)

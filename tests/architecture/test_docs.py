@@ -14,8 +14,8 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from gpe_pl.__main__ import VERBS
-from gpe_pl.config.entry_point import _groups as groups
 from gpe_pl.config.entry_point import compose
+from gpe_pl.config.explanations import groups
 from gpe_pl.data.importers import Format
 from gpe_pl.system.command_line import parsed
 

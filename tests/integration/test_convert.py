@@ -192,13 +192,13 @@ def test_imported_data_are_not_simulated() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["format=gsn"], "format='gsn': input should be 'gns', 'lagrangebench'"),
-        (["frame_dt=-1"], "frame_dt=-1: input should be greater than 0"),
+        (["format=gsn"], "format='gsn': must be 'gns', 'lagrangebench'"),
+        (["frame_dt=-1"], "frame_dt=-1: must be greater than 0"),
         (["name=a/b"], "name='a/b': must be a folder's name"),
         (["materials={7:mud}"], "unknown material 'mud'; known: sand"),
         (["parameters={mud:1}"], "unknown material 'mud'"),
         (["walls={front:1}"], "walls: unknown side 'front'; known: x_low"),
-        (["holdout=0.9"], "holdout=0.9: input should be less than or equal to 0.4"),
+        (["holdout=0.9"], "holdout=0.9: must be at most 0.4"),
     ],
 )
 def test_a_wrong_setting_is_named(tmp_path: Path, overrides: list[str], message: str) -> None:

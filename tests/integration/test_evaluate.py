@@ -163,7 +163,7 @@ def test_film_and_model_are_exported_on_request(tiny_data: Path, tmp_path: Path)
 
 
 def test_an_unknown_format_is_refused(tiny_data: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"evaluation\.export\.0='vtu': input should be 'vtk', 'npz', 'mp4' or 'model'"):
+    with pytest.raises(ConfigError, match=r"evaluation\.export\.0='vtu': must be 'vtk', 'npz', 'mp4' or 'model'"):
         evaluate(tiny_data, tmp_path, "x.ckpt", "evaluation.export=[vtu]")
 
 

@@ -287,7 +287,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
         if first.name not in own:
             own[first.name] = first.assumed
             notes.append(
-                f"{first.name} of {material} is not in the source; {first.assumed:g} {first.unit} is stored (parameters={{{material}: …}})"
+                f"{first.name} of {material} is not in the source; {first.quantity(first.assumed)} is stored (parameters={{{material}: …}})"
             )
         parameters[material] = {name: value if np.ndim(value) == 0 else np.asarray(value)[moving] for name, value in own.items()}
     cells = _cells_of(nodes, moving, repairs)

@@ -10,7 +10,7 @@ import warnings
 import pytest
 
 from gpe_pl.errors import GpeError
-from gpe_pl.errors.printable import LONGEST, LogRecord, clean_messages, one_line, printable
+from gpe_pl.errors.printable import LONGEST, LogRecord, clean_messages, did_you_mean, one_line, printable
 from gpe_pl.files.markdown import table_row
 from gpe_pl.trajectory.store import StoreError
 
@@ -71,3 +71,11 @@ def test_warnings_and_tracebacks_of_others_are_printable(monkeypatch: pytest.Mon
 
 def test_cells_of_tables_are_printable() -> None:
     assert table_row(["a\nb", "\x1b[31m"]) == "| a\\nb | \\x1b[31m |"
+
+
+@pytest.mark.parametrize(
+    ("word", "answer"),
+    [("sadn", "; did you mean 'sand'?"), ("tyni", "; did you mean 'Tiny'?"), ("SAND", "; did you mean 'sand'?"), ("medium", ""), ("", "")],
+)
+def test_a_similar_word_is_offered(word: str, answer: str) -> None:
+    assert did_you_mean(word, ["snow", "sand", "Tiny", "paper"]) == answer
