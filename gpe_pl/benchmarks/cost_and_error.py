@@ -29,6 +29,7 @@ class Point:
         distance: energy distance [m] to the reference in the last frame, of each scene. It compares distributions, for times at which errors of single nodes
             carry no information.
         overhead: seconds of tuning, training and generating their data.
+        teacher: of a learned model, the name of the solver whose solutions it was trained on.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Point:
     mse: dict[str, list[float]] = field(default_factory=dict)
     distance: list[float] = field(default_factory=list)
     overhead: float = 0.0
+    teacher: str = ""
 
     def error(self, horizon: str) -> float:
         return float(np.mean(self.mse[horizon]))

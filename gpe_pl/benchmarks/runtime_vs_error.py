@@ -14,44 +14,34 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
 from pydantic import Field
 
-from gpe_pl.benchmarks.cost_and_error import (
-    WINNING_HORIZONS,
-    Family,
-    Point,
-    break_even,
-    cost_at_error,
-    error_at_cost,
-    front,
-    hypervolume,
-    paired_ratio,
-    ratio_at_cost,
-    winners,
-)
-from gpe_pl.benchmarks.solver_rungs import DATA, MODULI, NODES, SPACING, STEPS, coarser_solver, rungs
+from gpe_pl.benchmarks.cost_and_error import Family, Point, break_even, cost_at_error, hypervolume, paired_ratio, ratio_at_cost
+from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
+from gpe_pl.benchmarks.ladder_tables import BALLISTIC, REPEATED, of_own_moduli, section, summary
+from gpe_pl.benchmarks.reference_solutions import REFERENCES, ComparisonError, observed_order, stored_reference
+from gpe_pl.benchmarks.solver_rungs import DATA, MODULI, NODES, SPACING, STEPS, rungs
 from gpe_pl.benchmarks.spent_before import Spent, spent_on
-from gpe_pl.benchmarks.trained import Case, runs_in, trained_on
+from gpe_pl.benchmarks.timed_rollouts import Start, distance, squared_error, timed
+from gpe_pl.benchmarks.trained import Case, Labels, checkpoint_label, fingerprint_of, labels_of, model_label, runs_in, trained_on
 from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory, initial_state
-from gpe_pl.errors import GpeError
-from gpe_pl.files.markdown import table_row
 from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.metrics import Interval, bootstrap_interval, energy_distance
+from gpe_pl.metrics import Interval
 from gpe_pl.reports.finished_runs import Run
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import SimulationError, Simulator, steps
+from gpe_pl.rollout.loop import Simulator
 from gpe_pl.schema import Split
-from gpe_pl.solvers.finer_solver import FinerSolver, Refinable
-from gpe_pl.solvers.resolution import Resolved, coarser
+from gpe_pl.solvers.resolution import Resolved
+from gpe_pl.system.progress import progress_bar
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -60,15 +50,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Frame = tuple[np.ndarray, np.ndarray]
-"""Positions [node, dim] in m and velocities [node, dim] in m/s."""
-
-BALLISTIC = "ballistic"
-REPEATED = ", repeated predictions"
-
-
-class ComparisonError(GpeError, ValueError):
-    """Raised when a model or a reference solution is missing; the message says which."""
+RESUMES = True
+"""``run`` takes a folder and continues where an earlier run was stopped."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +65,7 @@ class Settings:
         step_factors: factors by which the solver's steps may also be longer, at the spacing of the data and at coarser ones.
         soft_factors: factors by which the solver's elastic moduli may also be smaller, where they are constants of the solver (``solver_rungs.softer``).
         repeats: numbers of frames for which predictions are repeated, each a further variant of every model (``Skips.repeat_frames``).
+        checkpoints: further models: files, or names of shipped models; each takes part in the case of its data set. Their training time is not known.
         tuning: folders of further runs that were trained to choose settings; the break-even counts their training.
         split, num_trajectories: split and number of the scenes.
         horizons: numbers of frames over which errors are averaged; the full length is always added.
@@ -95,6 +79,7 @@ class Settings:
     step_factors: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
     soft_factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [2.0, 4.0])
     repeats: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
+    checkpoints: list[str] = field(default_factory=list)
     tuning: list[str] = field(default_factory=list)
     split: Split = "test_unseen"
     num_trajectories: Annotated[int, Field(ge=1)] = 5
@@ -107,199 +92,187 @@ class Settings:
         return "cuda" if self.accelerator == "gpu" else "cpu"
 
 
-def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
-    """Return records of every simulator in every case, and a Markdown table per case with a section on where learned models lose.
+@dataclass(frozen=True)
+class Entrant:
+    """A learned model that takes part.
+
+    Attributes:
+        simulator: the model.
+        spent: what it cost before its first rollout.
+        teacher: name of the solver whose solutions it was trained on, as in ``solver_rungs``.
+    """
+
+    simulator: LearnedSimulator
+    spent: Spent
+    teacher: str = DATA
+
+
+def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tuple[list[dict[str, Any]], str]:
+    """Return records of every simulator in every case, and Markdown: a summary, and a table per case with a section on where learned models lose.
+
+    Scenes that had finished when an earlier run was stopped are not repeated. ``folder`` keeps their records until the suite ends, and the reference solutions
+    also afterwards.
 
     Raises:
-        ComparisonError: no finished run was trained on a data set, or the reference solution failed.
+        ComparisonError: no model was trained on a data set, or the solver has no reference solution.
+        GenerationError: a reference solution ended early.
     """
     torch.set_num_threads(settings.num_threads)
     records: list[dict[str, Any]] = []
-    parts = []
     finished = runs_in(settings.runs)
+    entrants = {name: _entrants(finished, spec, settings) for name, spec in specs.items()}
     for name, spec in specs.items():
-        models = _models(finished, spec, settings)
-        if not models:
+        if not entrants[name]:
             raise ComparisonError(
-                f"{' and '.join(settings.runs)}: no finished run that was trained on the data set {spec.name!r} of size {spec.size!r}; train with "
-                f"`python -m gpe_pl.fit experiment=table1 size={spec.size}` or set suite.runs"
+                f"{' and '.join([*settings.runs, *settings.checkpoints])}: no finished run that was trained on the data set {spec.name!r} of size "
+                f"{spec.size!r}; train with `python -m gpe_pl.fit experiment=table1 size={spec.size}`, or set suite.runs or suite.checkpoints"
             )
-        log.info("%s: %d models", name, len(models))
-        points, order = compare(spec, models, settings)
+    results: dict[str, tuple[list[Point], float]] = {}
+    for name, spec in specs.items():
+        log.info("%s: %d models", name, len(entrants[name]))
+        points, order = results[name] = compare(spec, entrants[name], settings, folder, name)
         records += [{**record, "seed": spec.seed} for record in _records(name, points, order)]
-        parts.append(_section(name, points, order, settings.num_trajectories))
-    return records, "\n\n".join(parts)
+    FinishedParts(folder / PARTS).clear()
+    sections = [section(name, points, order, settings.num_trajectories) for name, (points, order) in results.items()]
+    return records, "\n\n".join([summary({name: points for name, (points, _) in results.items()}), *sections])
 
 
-def _models(finished: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[str, tuple[LearnedSimulator, Spent]]:
+def _entrants(finished: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[str, Entrant]:
     """Return trained simulators, with variants that repeat predictions, and what they cost before, by label."""
-    found, tuning = {}, runs_in(settings.tuning)
-    for label, (simulator, run) in trained_on(spec, finished, with_strides=True).items():
-        spent = spent_on(run, finished, tuning)
-        found[label] = simulator.to(settings.device), spent
+    found: dict[str, Entrant] = {}
+    tuning = runs_in(settings.tuning)
+    for label, (simulator, run) in trained_on(spec, finished, with_strides=True, with_other_labels=True).items():
+        found[label] = Entrant(simulator, spent_on(run, finished, tuning), _teacher(labels_of(run, spec), spec))
+    for checkpoint in settings.checkpoints:
+        simulator = LearnedSimulator.from_checkpoint(checkpoint)
+        metadata = simulator.builder.metadata
+        if (metadata.dataset, metadata.spacing) == (spec.name, spec.scene.spacing):
+            found[f"{model_label(simulator)}, {checkpoint_label(checkpoint)}"] = Entrant(simulator, Spent(math.nan))
+    for label, entrant in list(found.items()):
+        simulator = entrant.simulator.to(settings.device)
         for repeats in settings.repeats:
             repeating = simulator.configured(skips=replace(simulator.skips, repeat_frames=repeats))
-            found[f"{label}{REPEATED} × {repeats}"] = repeating, spent
+            found[f"{label}{REPEATED} × {repeats}"] = replace(entrant, simulator=repeating)
     return found
 
 
-def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, Spent]], settings: Settings) -> tuple[list[Point], float]:
-    """Run all simulators on the same scenes; return their points and the solver's observed order of convergence."""
-    first = max(simulator.stride * simulator.builder.config.history for simulator, _ in models.values())
-    nodes = DATA if spec.fine == 1 else NODES
+def _teacher(labels: Labels, spec: DatasetSpec) -> str:
+    """Return the name of the solver that solved the labels, as in ``solver_rungs``."""
+    base = DATA if labels.fine == spec.fine else NODES
+    return base if labels.softness == 1 else f"{base}, {MODULI}{labels.softness:g}"
+
+
+def compare(
+    spec: DatasetSpec, entrants: dict[str, Entrant], settings: Settings, folder: Path | None = None, case: str = ""
+) -> tuple[list[Point], float]:
+    """Run all simulators on the same scenes; return their points and the solver's observed order of convergence.
+
+    Args:
+        spec: the data set.
+        entrants: learned models, by label.
+        settings: settings of the comparison.
+        folder: folder for finished scenes and reference solutions; None stores neither.
+        case: name of the case, for the progress bar.
+    """
     points: dict[str, Point] = {}
     orders = []
-    for index in range(settings.num_trajectories):
-        data = generate_trajectory(spec, settings.split, index)
-        start = initial_state(spec, settings.split, index)
-        reference = _reference(spec, start, data)
-        orders.append(_order(spec, start, data, reference))
-        truth = reference.frames(first)
-        history = data if spec.fine == 1 else generate_trajectory(replace(spec, fine=1), settings.split, index, num_frames=first + 1)
-        for name, family, simulator, at in _simulators(spec, start, history, models, first, settings):
-            point = points.setdefault(name, Point(name, family))
-            prediction, seconds = _timed(simulator, at, data, first)
-            if family == "learned":
-                fraction = first / (data.num_frames - 1)
-                seconds = fraction * points[nodes].seconds[-1] + (1 - fraction) * seconds
-            point.seconds.append(seconds)
-            error = _squared_error(prediction, truth)[1:]
-            for horizon in (*(h for h in settings.horizons if h <= len(error)), None):
-                point.mse.setdefault("full" if horizon is None else str(horizon), []).append(float(np.mean(error[:horizon])))
-            point.distance.append(_distance(prediction, truth))
-    rates: dict[int, float] = {spec.fine: points[DATA].cost, 1: points[nodes].cost}
-    for label, (_, spent) in models.items():
-        points[label].overhead = spent.seconds(rates, float(getattr(spec.scene, "num_particles", math.nan)))
+    identity = _identity(spec, entrants, settings)
+    parts = None if folder is None else FinishedParts(folder / PARTS)
+    with progress_bar(f"{case}: scenes") as on_progress:
+        for index in range(settings.num_trajectories):
+            on_progress(index, settings.num_trajectories)
+            known = {**identity, "index": index}
+            scene = parts.get(known) if parts else None
+            if scene is None:
+                scene = list(_scene(spec, index, entrants, settings, None if folder is None else folder / REFERENCES))
+                if parts:
+                    parts.put(known, scene)
+            orders += [_number(record["order"]) for record in scene if "order" in record]
+            for record in (r for r in scene if "simulator" in r):
+                point = points.setdefault(record["simulator"], Point(record["simulator"], record["family"]))
+                point.seconds.append(record["seconds"])
+                point.distance.append(_number(record["distance"], math.inf))
+                for horizon, error in record["mse"].items():
+                    point.mse.setdefault(horizon, []).append(_number(error, math.inf))
+        on_progress(settings.num_trajectories, settings.num_trajectories)
+    rates: dict[int, float] = {spec.fine: points[DATA].cost, 1: points[_nodes(spec)].cost}
+    for label, entrant in entrants.items():
+        points[label].overhead = entrant.spent.seconds(rates, float(getattr(spec.scene, "num_particles", math.nan)))
+        points[label].teacher = entrant.teacher
     return [*points.values()], float(np.nanmedian(orders))
 
 
+def _nodes(spec: DatasetSpec) -> str:
+    """Return the name of the solver at the spacing of the nodes."""
+    return DATA if spec.fine == 1 else NODES
+
+
+def _identity(spec: DatasetSpec, entrants: dict[str, Entrant], settings: Settings) -> dict[str, Any]:
+    """Return everything that the records of a scene depend on, except its number."""
+    models = {label: [fingerprint_of(e.simulator), e.simulator.stride, asdict(e.simulator.skips)] for label, e in entrants.items()}
+    keys = ("factors", "step_factors", "soft_factors", "split", "horizons", "num_threads", "accelerator")
+    return {"data": spec.as_dict(), "models": models, **{key: getattr(settings, key) for key in keys}}
+
+
+def _number(value: float | None, missing: float = math.nan) -> float:
+    return missing if value is None else value
+
+
+def _finite(value: float) -> float | None:
+    """Return a number that JSON can store; None for NaN and infinity."""
+    return value if math.isfinite(value) else None
+
+
+def _scene(
+    spec: DatasetSpec, index: int, entrants: dict[str, Entrant], settings: Settings, references: Path | None
+) -> Iterator[dict[str, Any]]:
+    """Run all simulators on one scene; yield the observed order, and a record for each simulator. Errors of failed rollouts are None."""
+    first = max(e.simulator.stride * e.simulator.builder.config.history for e in entrants.values())
+    reference = stored_reference(spec, settings.split, index, references)
+    yield {"order": _finite(observed_order(spec, settings.split, index, reference))}
+    start = initial_state(spec, settings.split, index)
+    history = generate_trajectory(replace(spec, fine=1), settings.split, index, num_frames=first + 1)
+    truth = reference.frames(first)
+    seconds_of = {}
+    for name, family, simulator, at in _simulators(spec, start, history, entrants, first, settings):
+        prediction, seconds = timed(simulator, at, reference, first)
+        if family == "learned":
+            fraction = first / (reference.num_frames - 1)
+            seconds = fraction * seconds_of[_nodes(spec)] + (1 - fraction) * seconds
+        seconds_of[name] = seconds
+        error = squared_error(prediction, truth)[1:]
+        mse = {str(h): float(np.mean(error[:h])) for h in settings.horizons if h <= len(error)} | {"full": float(np.mean(error))}
+        yield {
+            "simulator": name,
+            "family": family,
+            "seconds": seconds,
+            "mse": {horizon: _finite(value) for horizon, value in mse.items()},
+            "distance": _finite(distance(prediction, truth)),
+        }
+
+
 # --- simulators -------------------------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Restricted:
-    """Start of a simulator.
-
-    Attributes:
-        resolved: its state, and the map from its positions to those of the scene's nodes.
-        from_start: whether it starts at frame 0, not where all learned models have enough history.
-        frames_per_step: number of frames that one step advances.
-    """
-
-    resolved: Resolved
-    from_start: bool
-    frames_per_step: int = 1
 
 
 def _simulators(
     spec: DatasetSpec,
     start: State,
     history: Trajectory,
-    models: dict[str, tuple[LearnedSimulator, Spent]],
+    entrants: dict[str, Entrant],
     first: int,
     settings: Settings,
-) -> Iterator[tuple[str, Family, Simulator, _Restricted]]:
+) -> Iterator[tuple[str, Family, Simulator, Start]]:
     """Yield the simulators. Solvers start at frame 0, all others at frame ``first`` of ``history``, where all learned models have enough of it."""
     for rung in rungs(spec, start, settings.factors, settings.step_factors, settings.soft_factors):
-        yield rung.name, "solver", rung.solver, _Restricted(rung.start, True, rung.frames_per_step)
+        yield rung.name, "solver", rung.solver, Start(rung.start, True, rung.frames_per_step)
     dt = spec.solver.frame_dt
-    for label, (simulator, _) in models.items():
+    for label, simulator in ((label, entrant.simulator) for label, entrant in entrants.items()):
         seen = history.frames(first % simulator.stride).every(simulator.stride)
-        at = _Restricted(Resolved(simulator.initial_state(seen, first // simulator.stride), lambda pos: pos), False, simulator.stride)
+        at = Start(Resolved(simulator.initial_state(seen, first // simulator.stride), lambda pos: pos), False, simulator.stride)
         yield label, "learned", Contained(approximate(simulator), simulator.stride * dt), at
     for name, baseline in BASELINES.items():
         state = history.state(first, first)
-        yield name.replace("_", " "), "trivial", baseline(dt), _Restricted(Resolved(state, lambda pos: pos), False)
-
-
-def _reference(spec: DatasetSpec, start: State, data: Trajectory) -> Trajectory:
-    """Run the solver at half the spacing of the data's, seen at the nodes of the scene."""
-    if not isinstance(spec.solver, Refinable):
-        raise ComparisonError(f"{spec.name}: the solver {spec.solver.name} has no solution at a finer spacing to compare with")
-    solver = FinerSolver(spec.solver.finer(2 * spec.fine), 2 * spec.fine, spec.scene.spacing)
-    prediction, _ = _timed(solver, _Restricted(Resolved(start, lambda pos: pos), True), data, 0)
-    if prediction.num_frames < data.num_frames:
-        raise ComparisonError(f"{spec.name}: the reference solution failed after {prediction.num_frames - 1} frames")
-    return prediction
-
-
-def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Trajectory, num_frames: int = 20) -> float:
-    """Return the observed order P = log₂ (|u_2h − u_h| / |u_h − u_{h/2}|) over the first frames; NaN if there is no rollout with spacing 2h.
-
-    h is the spacing at which the data were solved.
-    """
-    is_fine = spec.fine > 1
-    solver = spec.refined(spec.fine // 2) if is_fine else coarser_solver(spec, 2.0)
-    try:
-        resolved = Resolved(start, lambda pos: pos) if is_fine else coarser(start, spec.scene.spacing, 2.0)
-    except ValueError:
-        return float("nan")
-    if solver is None:
-        return float("nan")
-    few = data.frames(0, min(num_frames, data.num_frames - 1) + 1)
-    coarse, _ = _timed(solver, _Restricted(resolved, True), few, 0)
-    if coarse.num_frames < few.num_frames:
-        return float("nan")
-    first = np.sqrt(np.mean(np.square(few.pos.astype(np.float64) - reference.pos[: few.num_frames])))
-    second = np.sqrt(np.mean(np.square(coarse.pos - few.pos)))
-    return float(np.log2(second / first))
-
-
-def _timed(simulator: Any, at: _Restricted, data: Trajectory, kept_from: int) -> tuple[Trajectory, float]:
-    """Run from the start ``at`` to the end of the data. Return the rollout from frame ``kept_from`` on, and its computing time over its simulated time.
-
-    The rollout has the nodes of the scene. The first step runs twice and is timed once, so that compilation and first use of memory do not count. Time is
-    processor time on a CPU, which counts every thread and depends less on other work, and wall time on a GPU. A failed rollout ends early. Frames within a step
-    are interpolated.
-    """
-    start: Any = at.resolved.state
-    dt = data.metadata.frame_dt
-    first, every = 0 if at.from_start else kept_from, at.frames_per_step
-    wanted = data.num_frames - first
-    clock = time.perf_counter if isinstance(start.pos, torch.Tensor) and start.pos.is_cuda else time.process_time
-    frames, seconds, num_steps = [_numpy(start)], 0.0, 0
-    try:
-        simulator.step(start)
-        begun = clock()
-        for state in steps(simulator, start, -(-(wanted - 1) // every)):
-            if isinstance(state.pos, torch.Tensor) and state.pos.is_cuda:
-                torch.cuda.synchronize()
-            seconds += clock() - begun
-            num_steps += 1
-            pos, vel = _numpy(state)
-            if not np.isfinite(pos).all():
-                break
-            frames += [_between(frames[-1], (pos, vel), k / every) for k in range(1, every)] + [(pos, vel)]
-            begun = clock()
-    except SimulationError as error:
-        log.info("%s stopped: %s", type(simulator).__name__, error)
-    pos = np.stack([at.resolved.restrict(p) for p, _ in frames[:wanted]])
-    vel = np.stack([(at.resolved.restrict(p + dt * v) - at.resolved.restrict(p)) / dt for p, v in frames[:wanted]])
-    trajectory = replace(data, pos=pos, vel=vel, stress=None).frames(kept_from - first)
-    return trajectory, seconds / max(1, num_steps) / (every * dt)
-
-
-def _between(before: Frame, after: Frame, fraction: float) -> Frame:
-    return before[0] + fraction * (after[0] - before[0]), before[1] + fraction * (after[1] - before[1])
-
-
-def _numpy(state: State) -> Frame:
-    pos, vel = (x.detach().cpu().numpy() if isinstance(x, torch.Tensor) else x for x in (state.pos, state.vel))
-    return np.array(pos, dtype=np.float64), np.array(vel, dtype=np.float64)
-
-
-def _squared_error(prediction: Trajectory, truth: Trajectory) -> np.ndarray:
-    """Return the mean squared error of every frame [m²], over nodes and axes; infinite for missing frames. Frame 0 may differ between resolutions."""
-    error = np.full(truth.num_frames, np.inf)
-    count = prediction.num_frames
-    error[:count] = np.square(prediction.pos.astype(np.float64) - truth.pos[:count]).mean(axis=(1, 2))
-    return error
-
-
-def _distance(prediction: Trajectory, truth: Trajectory) -> float:
-    if prediction.num_frames < truth.num_frames:
-        return float("inf")
-    return energy_distance(prediction.pos[-1], truth.pos[-1], prediction.mass, truth.mass)
+        yield name.replace("_", " "), "trivial", baseline(dt), Start(Resolved(state, lambda pos: pos), False)
 
 
 def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[str, Any]]:
@@ -324,10 +297,10 @@ def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[
             yield {"metric": "time_ratio_at_equal_error", **about, "horizon": horizon, "value": ratio, "unit": "1"}
             if (paired := ratio_at_cost(point, solvers, horizon)) is not None:
                 yield {"metric": "error_ratio_at_equal_time", **about, "horizon": horizon, **_of_interval(paired)}
-            if (paired := ratio_at_cost(point, _of_own_moduli(solvers), horizon)) is not None:
+            if (paired := ratio_at_cost(point, of_own_moduli(solvers), horizon)) is not None:
                 yield {"metric": "error_ratio_at_equal_time_and_moduli", **about, "horizon": horizon, **_of_interval(paired)}
-            for data in (p for p in solvers if p.name == DATA):
-                paired = paired_ratio(point.mse[horizon], data.mse[horizon])
+            for teacher in (p for p in solvers if p.name == point.teacher):
+                paired = paired_ratio(point.mse[horizon], teacher.mse[horizon])
                 yield {"metric": "error_ratio_to_training_data", **about, "horizon": horizon, **_of_interval(paired)}
             yield {
                 "metric": "break_even",
@@ -367,139 +340,6 @@ def _points(records: Sequence[dict[str, Any]], case: str) -> list[Point]:
             elif r["metric"] == "overhead":
                 point.overhead = r["value"]
     return [*points.values()]
-
-
-def _section(case: str, points: Sequence[Point], order: float, num_trajectories: int) -> str:
-    horizons = [*points[0].mse]
-    solvers = [p for p in points if p.family == "solver"]
-    header = ["", "time per simulated second", *(f"MSE @{h}" for h in horizons), "energy distance [mm]"]
-    lines = [table_row(header), "|" + "---|" * len(header)]
-    best = {DATA, NODES} | {p.name for h in horizons for p in front(solvers, h)}
-    shown = [p for p in points if p.family != "solver" or p.name in best]
-    for point in sorted(shown, key=lambda p: (("solver", "learned", "trivial").index(p.family), -p.cost)):
-        cells = [_interval(point.mse[h], 1e3) for h in horizons]
-        lines.append(table_row([point.name, f"{point.cost:.3g}", *cells, f"{1e3 * np.mean(point.distance):.3g}"]))
-    note = (
-        f"{num_trajectories} scenes. MSE ×1e-3 [m²] to the solver at half the spacing of the data's, whose observed order of convergence is "
-        f"{order:.1f} (positions, first 20 frames): mean and 95 % interval over scenes. `{DATA}` is the error in the "
-        "training data. Times: processor time of one core, warm, neighbour search and features included. Those of learned models include the solver "
-        "that computes the frames before their first."
-    )
-    if len(shown) < len(points):
-        note += f" Of the solvers, {len(points) - len(shown)} are only in `results.json`: at each horizon, another one is at least as fast and as accurate."
-    lost = ["", *_ratios(points, horizons), "", "**Where the learned models lose**: time of a solver of the same error over theirs", ""]
-    lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
-    for point in (p for p in points if p.family == "learned"):
-        lost.append(table_row([point.name, *(_against(point, solvers, h) for h in horizons)]))
-    lost += [
-        "",
-        "**Break-even**: seconds of simulation after which tuning, training and their data have paid off, against a solver of the same error",
-        "",
-    ]
-    after = {p.name: [break_even(p, solvers, h, duration=1.0) for h in horizons] for p in points if p.family == "learned"}
-    if np.isinf([*after.values()]).all():
-        lost.append("Never, for any of the models.")
-    else:
-        lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
-        lost += [table_row([name, *map(_pays_off, values)]) for name, values in after.items()]
-    return "\n".join([f"### {case}", "", *lines, "", note, "", "**At equal error**", "", *verdicts(points, horizons), *lost])
-
-
-def _ratios(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
-    """Yield a table of learned models against the solvers at equal time and against the solver of their data, and who wins."""
-    solvers = [p for p in points if p.family == "solver"]
-    data = next((p for p in solvers if p.name == DATA), None)
-    yield from (
-        "**At equal time**: error over that of a solver of the same cost, and over that of the training data's solver at its own cost",
-        "",
-    )
-    yield table_row(["", "against", *(f"@{h}" for h in horizons)])
-    yield "|" + "---|" * (2 + len(horizons))
-    for point in (p for p in points if p.family == "learned"):
-        at_cost = [ratio_at_cost(point, solvers, h) for h in horizons]
-        yield table_row([point.name, "solver of the same cost", *map(_ratio, at_cost)])
-        if (hard := _of_own_moduli(solvers)) != solvers:
-            at_cost = [ratio_at_cost(point, hard, h) for h in horizons]
-            yield table_row([point.name, "the same, moduli of the data", *map(_ratio, at_cost)])
-        if data is not None:
-            yield table_row([point.name, "solver of the data", *(_ratio(paired_ratio(point.mse[h], data.mse[h])) for h in horizons)])
-    winning = winners(points, horizons)
-    rule = f"A model wins if the 95 % interval over paired scenes lies below 1 at equal time, at {WINNING_HORIZONS} horizons or more."
-    yield from ("", f"{rule} {'**' + ', '.join(winning) + '** wins.' if winning else 'None does.'}")
-    if (hard := _of_own_moduli(solvers)) != solvers:
-        winning = winners([*hard, *(p for p in points if p.family == "learned")], horizons)
-        found = f"{', '.join(winning)} would win" if winning else "none would win, either"
-        yield from ("", f"If the solver had to keep the elastic moduli of the data, {found}.")
-
-
-def _of_own_moduli(solvers: Sequence[Point]) -> list[Point]:
-    """Return the solvers whose elastic moduli are those of the data."""
-    return [p for p in solvers if MODULI not in p.name]
-
-
-def _ratio(interval: Interval | None) -> str:
-    if interval is None:
-        return "every solver costs more"
-    text = f"{interval.estimate:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
-    return f"**{text}**" if interval.high < 1 else text
-
-
-def _pays_off(seconds: float) -> str:
-    return "never" if math.isinf(seconds) else "not known" if math.isnan(seconds) else f"{seconds:.3g}"
-
-
-def _against(point: Point, solvers: Sequence[Point], horizon: str) -> str:
-    """Return the table cell that compares a model with the solvers at equal error; below 1 the model is slower."""
-    needed = cost_at_error(solvers, point.error(horizon), horizon)
-    if needed <= point.cost:
-        return f"{needed / point.cost:.2g}"
-    if np.isinf(needed):
-        return "**more accurate than every solver that was run**"
-    if point.error(horizon) > front(solvers, horizon)[0].error(horizon):
-        return "cheaper and less accurate than every solver that was run"
-    return f"**{needed / point.cost:.2g}**"
-
-
-def verdicts(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
-    """Yield one line per horizon: whether a learned model lies below the solvers' front, or what the nearest model lacks."""
-    solvers = [p for p in points if p.family == "solver"]
-    learned = [p for p in points if p.family == "learned"]
-    for horizon in horizons:
-        comparable = [p for p in learned if p.error(horizon) <= front(solvers, horizon)[0].error(horizon)]
-        gain = {p.name: cost_at_error(solvers, p.error(horizon), horizon) / p.cost for p in comparable}
-        if not gain:
-            yield f"- @{horizon}: {_none_as_accurate(learned, front(solvers, horizon)[0], horizon)}"
-            continue
-        nearest = max(comparable, key=lambda p: gain[p.name])
-        if gain[nearest.name] > 1:
-            ahead = [name for name, value in gain.items() if value > 1]
-            yield f"- @{horizon}: **below the solver's curve**: {', '.join(ahead)}."
-            continue
-        error = error_at_cost(solvers, nearest.cost, horizon)
-        yield (
-            f"- @{horizon}: no learned model passes below the solver's curve. Nearest is {nearest.name}: it would have to be "
-            f"{_rounded(1 / gain[nearest.name])} times faster, or {_rounded(nearest.error(horizon) / error)} times more accurate at its cost."
-        )
-
-
-def _none_as_accurate(learned: Sequence[Point], cheapest: Point, horizon: str) -> str:
-    nearest = min(learned, key=lambda p: p.error(horizon))
-    return (
-        f"no learned model is as accurate as the cheapest of the solvers ({cheapest.name}). Nearest is {nearest.name}: it would have to be "
-        f"{_rounded(nearest.error(horizon) / cheapest.error(horizon))} times more accurate and {_rounded(nearest.cost / cheapest.cost)} times faster."
-    )
-
-
-def _rounded(factor: float) -> str:
-    """Format with two digits; from a million on, with an exponent."""
-    return f"{float(f'{factor:.2g}'):g}"
-
-
-def _interval(values: list[float], scale: float) -> str:
-    if not np.isfinite(values).all():
-        return f"{int((~np.isfinite(values)).sum())} of {len(values)} failed"
-    i = bootstrap_interval(np.array([values]) * scale, statistic=np.mean)
-    return f"{i.estimate:.3g} [{i.low:.3g}, {i.high:.3g}]"
 
 
 def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:

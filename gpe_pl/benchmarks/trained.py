@@ -8,7 +8,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
+from gpe_pl.benchmarks.solver_rungs import CONSTANT_MODULI
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.errors import GpeError
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -54,7 +56,48 @@ def of_stored_frames(checkpoint: Path | str) -> LearnedSimulator:
     return simulator
 
 
-def trained_on(spec: DatasetSpec, runs: Iterable[Run], with_strides: bool = False) -> dict[str, tuple[LearnedSimulator, Run]]:
+@dataclass(frozen=True)
+class Labels:
+    """How the labels of a training were solved.
+
+    Attributes:
+        fine: factor by which their solver divides the spacing of the nodes (``data.fine``).
+        softness: factor by which its constant elastic moduli are smaller than those of a data set.
+    """
+
+    fine: int
+    softness: float = 1.0
+
+    def __str__(self) -> str:
+        changes = ([f"spacing ÷ {self.fine}"] if self.fine > 1 else []) + ([f"moduli ÷ {self.softness:g}"] if self.softness != 1 else [])
+        return f"labels: {' and '.join(changes)}" if changes else ""
+
+
+def labels_of(run: Run, spec: DatasetSpec) -> Labels:
+    """Return how the labels of a run were solved, with moduli relative to those of ``spec``."""
+    ratios = []
+    for material in getattr(spec.solver, "materials", ()) if hasattr(spec.solver, "constants_of") else ():
+        constants: Any = spec.solver.constants_of(material)
+        for name in CONSTANT_MODULI:
+            if hasattr(constants, name):
+                own = getattr(constants, name)
+                ratios.append(own / float(run.config.get(f"data.solver.{material}.{name}") or own))
+    return Labels(int(run.config.get("data.fine", 1)), float(f"{max(ratios, default=1.0):.4g}"))
+
+
+def _same_scenes(run: Run, spec: DatasetSpec) -> bool:
+    """Tell whether a run was trained on the data set, or on one of the same scenes with labels that are no finer."""
+
+    def plain(name: str, fine: int) -> str:
+        return name.removesuffix(f"_fine{fine}")
+
+    fine = int(run.config.get("data.fine", 1))
+    return plain(str(run.config["data.name"]), fine) == plain(spec.name, spec.fine) and fine <= spec.fine
+
+
+def trained_on(
+    spec: DatasetSpec, runs: Iterable[Run], with_strides: bool = False, with_other_labels: bool = False
+) -> dict[str, tuple[LearnedSimulator, Run]]:
     """Return simulators that were trained on a data set of this name and size, and their runs, by label.
 
     A label names the model, its stride if that is not 1, and the settings of training and graph in which its runs differ, without those in
@@ -64,16 +107,20 @@ def trained_on(spec: DatasetSpec, runs: Iterable[Run], with_strides: bool = Fals
         spec: the data set.
         runs: finished runs; those on other data sets are left out.
         with_strides: whether models may have a stride.
+        with_other_labels: whether the labels may also be of a solver at another spacing or with other elastic moduli (``Labels``); then a label says which.
 
     Raises:
         StrideError: a model was trained with ``data.stride`` above 1, unless ``with_strides``.
     """
     same: dict[str, list[tuple[LearnedSimulator, Run]]] = defaultdict(list)
     for run in runs:
-        if (run.config["data.name"], run.config["size.name"]) == (spec.name, spec.size):
+        is_same = _same_scenes(run, spec) if with_other_labels else run.config["data.name"] == spec.name
+        if is_same and run.config["size.name"] == spec.size:
             checkpoint = run.folder / "checkpoints" / "best.ckpt"
             simulator = LearnedSimulator.from_checkpoint(checkpoint) if with_strides else of_stored_frames(checkpoint)
-            label = model_label(simulator) + (f", stride {simulator.stride}" if simulator.stride > 1 else "")
+            stride = f"stride {simulator.stride}" if simulator.stride > 1 else ""
+            labels = str(labels_of(run, spec)) if with_other_labels else ""
+            label = ", ".join(part for part in (model_label(simulator), stride, labels) if part)
             same[label].append((simulator, run))
     found: dict[str, tuple[LearnedSimulator, Run]] = {}
     for label, members in same.items():

@@ -22,10 +22,13 @@ from gpe_pl.benchmarks.cost_and_error import (
     ratio_at_cost,
     winners,
 )
-from gpe_pl.benchmarks.runtime_vs_error import ComparisonError, Settings, _models, _Restricted, _timed, compare, figures, run, verdicts
+from gpe_pl.benchmarks.ladder_tables import summary, verdicts
+from gpe_pl.benchmarks.reference_solutions import REFERENCES, ComparisonError, stored_reference
+from gpe_pl.benchmarks.runtime_vs_error import Entrant, Settings, _entrants, compare, figures, run
 from gpe_pl.benchmarks.solver_rungs import DATA, NODES
 from gpe_pl.benchmarks.spent_before import Simulated, Spent
-from gpe_pl.benchmarks.trained import Case
+from gpe_pl.benchmarks.timed_rollouts import Start, timed
+from gpe_pl.benchmarks.trained import Case, Labels
 from gpe_pl.config.datasets import dataset, dataset_spec
 from gpe_pl.data.ground_truth import generate_trajectory, initial_state, trajectory_metadata
 from gpe_pl.graphs.builder import GraphBuilder
@@ -124,7 +127,7 @@ def untrained(stride: int = 1) -> LearnedSimulator:
 def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
     settings = Settings({}, [], factors=[2.0], step_factors=[2], num_trajectories=1, horizons=[10])
-    points, order = compare(spec, {"GPE 1 × 8": (untrained(), Spent(60.0, (Simulated(1, 150.0, 10.0),)))}, settings)
+    points, order = compare(spec, {"GPE 1 × 8": Entrant(untrained(), Spent(60.0, (Simulated(1, 150.0, 10.0),)))}, settings)
     by_name = {p.name: p for p in points}
     assert {DATA, "GPE 1 × 8", "ballistic", "stops at walls", "constant velocity"} < set(by_name)
     assert by_name[DATA].error("10") < by_name["solver, spacing × 2"].error("10") < by_name["constant velocity"].error("10")
@@ -137,7 +140,7 @@ def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
 
 def test_a_model_with_longer_frames_starts_with_the_others_and_is_seen_at_all_frames() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
-    models = {"every": (untrained(), Spent(0.0)), "third": (untrained(3), Spent(0.0))}  # before training they fall freely
+    models = {"every": Entrant(untrained(), Spent(0.0)), "third": Entrant(untrained(3), Spent(0.0))}  # before training they fall freely
     points, _ = compare(spec, models, Settings({}, [], factors=[], step_factors=[], soft_factors=[], num_trajectories=1, horizons=[9]))
     by_name = {p.name: p for p in points}
     assert by_name["third"].error("9") == pytest.approx(by_name["every"].error("9"), rel=0.3)
@@ -147,16 +150,16 @@ def test_a_model_with_longer_frames_starts_with_the_others_and_is_seen_at_all_fr
 def test_models_of_finer_labels_start_where_the_solver_at_their_own_spacing_is(monkeypatch: pytest.MonkeyPatch) -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES, "data.fine=2"))
     seen = []
-    monkeypatch.setattr(module, "_reference", lambda spec, start, data: data)
-    monkeypatch.setattr(module, "_order", lambda *_: 1.0)
+    monkeypatch.setattr(module, "stored_reference", lambda spec, split, index, _: generate_trajectory(spec, split, index))
+    monkeypatch.setattr(module, "observed_order", lambda *_: 1.0)
 
-    def timed(simulator: Any, at: Any, data: Trajectory, kept_from: int) -> tuple[Trajectory, float]:
+    def fake(simulator: Any, at: Any, data: Trajectory, kept_from: int) -> tuple[Trajectory, float]:
         seen.append((simulator, at))
         return data.frames(kept_from), 1.0 if at.from_start else 0.5
 
-    monkeypatch.setattr(module, "_timed", timed)
+    monkeypatch.setattr(module, "timed", fake)
     settings = Settings({}, [], factors=[], step_factors=[], soft_factors=[], num_trajectories=1, horizons=[9])
-    points, _ = compare(spec, {"model": (untrained(), Spent(0.0))}, settings)
+    points, _ = compare(spec, {"model": Entrant(untrained(), Spent(0.0))}, settings)
     by_name = {p.name: p for p in points}
     assert {DATA, NODES} < set(by_name)
     plain = generate_trajectory(replace(spec, fine=1), "test_unseen", 0, num_frames=3)
@@ -171,8 +174,8 @@ def test_longer_steps_are_as_many_frames_and_what_lies_between_is_interpolated()
     data, start = generate_trajectory(spec, "test", 0), initial_state(spec, "test", 0)
     dt = data.metadata.frame_dt
     for every in (1, 3):
-        at = _Restricted(Resolved(start, lambda pos: pos), True, every)
-        prediction, _ = _timed(ConstantVelocity(every * dt), at, data, 0)
+        at = Start(Resolved(start, lambda pos: pos), True, every)
+        prediction, _ = timed(ConstantVelocity(every * dt), at, data, 0)
         times = dt * np.arange(data.num_frames)[:, None, None]
         assert prediction.num_frames == data.num_frames
         np.testing.assert_allclose(prediction.pos, start.pos + times * start.vel, rtol=1e-6, atol=1e-9)
@@ -183,14 +186,15 @@ def test_every_model_also_repeats_its_predictions(monkeypatch: pytest.MonkeyPatc
     simulator.model = GNS(simulator.builder.spec, num_message_passing_steps=1, hidden_channels=8)
     monkeypatch.setattr(module, "trained_on", lambda *_, **__: {"GNS": (simulator, None)})
     monkeypatch.setattr(module, "spent_on", lambda *_: Spent(120.0))
-    models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), Settings({}, [], repeats=[2, 4]))
-    assert {label: (s.skips.repeat_frames, spent) for label, (s, spent) in models.items()} == {
+    monkeypatch.setattr(module, "labels_of", lambda *_: Labels(1))
+    models = _entrants([], dataset_spec(compose("simulate", *OVERRIDES)), Settings({}, [], repeats=[2, 4]))
+    assert {label: (e.simulator.skips.repeat_frames, e.spent) for label, e in models.items()} == {
         "GNS": (1, Spent(120.0)),
         "GNS, repeated predictions × 2": (2, Spent(120.0)),
         "GNS, repeated predictions × 4": (4, Spent(120.0)),
     }
     weights = [*simulator.model.parameters()]
-    assert all(own is shared for s, _ in models.values() for own, shared in zip(s.model.parameters(), weights, strict=True))
+    assert all(own is shared for e in models.values() for own, shared in zip(e.simulator.model.parameters(), weights, strict=True))
 
 
 def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -207,9 +211,9 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
     ]
     for p in points:
         p.distance = [1e-3]
-    monkeypatch.setattr(module, "_models", lambda *_: {"model": None})
+    monkeypatch.setattr(module, "_entrants", lambda *_: {"model": None})
     monkeypatch.setattr(module, "compare", lambda *_: (points, 1.3))
-    records, table = run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec})
+    records, table = run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec}, tmp_path)
     assert "| model | **1.3** |" in table and "| slow model | 0.15 |" in table
     assert "| slow model | never |" in table
     assert {(r["simulator"], r["value"]) for r in records if r["metric"] == "break_even"} >= {("slow model", float("inf")), ("model", 0.0)}
@@ -235,7 +239,7 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
 def test_nothing_to_compare_says_so(tmp_path: Path) -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
     with pytest.raises(ComparisonError, match=": no finished run that was trained on the data set 'sand' of size 'tiny'"):
-        run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec})
+        run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec}, tmp_path)
 
 
 def test_the_suite_also_has_scenes_of_2500_nodes_at_the_spacing_of_the_small_ones() -> None:
