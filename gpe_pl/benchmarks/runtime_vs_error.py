@@ -12,6 +12,7 @@ a finer solver, and its time is part of the models' cost. A model thus gets no p
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 from collections.abc import Iterator, Sequence
@@ -30,7 +31,17 @@ from gpe_pl.benchmarks.reference_solutions import REFERENCES, ComparisonError, o
 from gpe_pl.benchmarks.solver_rungs import DATA, MODULI, NODES, SPACING, STEPS, rungs
 from gpe_pl.benchmarks.spent_before import Spent, spent_on
 from gpe_pl.benchmarks.timed_rollouts import Start, distance, squared_error, timed
-from gpe_pl.benchmarks.trained import Case, Labels, checkpoint_label, fingerprint_of, labels_of, model_label, runs_in, trained_on
+from gpe_pl.benchmarks.trained import (
+    Case,
+    Labels,
+    checkpoint_label,
+    fingerprint_of,
+    has_scenes_of,
+    labels_of,
+    model_label,
+    runs_in,
+    trained_on,
+)
 from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory, initial_state
 from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -146,8 +157,10 @@ def _entrants(finished: Sequence[Run], spec: DatasetSpec, settings: Settings) ->
     for checkpoint in settings.checkpoints:
         simulator = LearnedSimulator.from_checkpoint(checkpoint)
         metadata = simulator.builder.metadata
-        if (metadata.dataset, metadata.spacing) == (spec.name, spec.scene.spacing):
-            found[f"{model_label(simulator)}, {checkpoint_label(checkpoint)}"] = Entrant(simulator, Spent(math.nan))
+        fine = int(json.loads(metadata.config).get("fine", 1))
+        if has_scenes_of(spec, metadata.dataset, fine) and metadata.spacing == spec.scene.spacing:
+            label = f"{model_label(simulator)}, {checkpoint_label(checkpoint)}"
+            found[label] = Entrant(simulator, Spent(math.nan), _teacher(Labels(fine), spec))
     for label, entrant in list(found.items()):
         simulator = entrant.simulator.to(settings.device)
         for repeats in settings.repeats:

@@ -85,14 +85,18 @@ def labels_of(run: Run, spec: DatasetSpec) -> Labels:
     return Labels(int(run.config.get("data.fine", 1)), float(f"{max(ratios, default=1.0):.4g}"))
 
 
-def _same_scenes(run: Run, spec: DatasetSpec) -> bool:
-    """Tell whether a run was trained on the data set, or on one of the same scenes with labels that are no finer."""
+def has_scenes_of(spec: DatasetSpec, name: str, fine: int) -> bool:
+    """Tell whether a data set is ``spec``, or has the same scenes with labels that are no finer.
+
+    Args:
+        spec: a data set.
+        name, fine: name of another one, and the factor by which the solver of its labels divides the spacing.
+    """
 
     def plain(name: str, fine: int) -> str:
         return name.removesuffix(f"_fine{fine}")
 
-    fine = int(run.config.get("data.fine", 1))
-    return plain(str(run.config["data.name"]), fine) == plain(spec.name, spec.fine) and fine <= spec.fine
+    return plain(name, fine) == plain(spec.name, spec.fine) and fine <= spec.fine
 
 
 def trained_on(
@@ -114,7 +118,8 @@ def trained_on(
     """
     same: dict[str, list[tuple[LearnedSimulator, Run]]] = defaultdict(list)
     for run in runs:
-        is_same = _same_scenes(run, spec) if with_other_labels else run.config["data.name"] == spec.name
+        name, fine = str(run.config["data.name"]), int(run.config.get("data.fine", 1))
+        is_same = has_scenes_of(spec, name, fine) if with_other_labels else name == spec.name
         if is_same and run.config["size.name"] == spec.size:
             checkpoint = run.folder / "checkpoints" / "best.ckpt"
             simulator = LearnedSimulator.from_checkpoint(checkpoint) if with_strides else of_stored_frames(checkpoint)

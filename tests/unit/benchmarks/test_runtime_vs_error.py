@@ -22,7 +22,7 @@ from gpe_pl.benchmarks.cost_and_error import (
     ratio_at_cost,
     winners,
 )
-from gpe_pl.benchmarks.ladder_tables import summary, verdicts
+from gpe_pl.benchmarks.ladder_tables import section, summary, verdicts
 from gpe_pl.benchmarks.reference_solutions import REFERENCES, ComparisonError, stored_reference
 from gpe_pl.benchmarks.runtime_vs_error import Entrant, Settings, _entrants, compare, figures, run
 from gpe_pl.benchmarks.solver_rungs import DATA, NODES
@@ -36,6 +36,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
+from gpe_pl.reports.finished_runs import Run, table_of
 from gpe_pl.rollout.baselines import ConstantVelocity
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.solvers.resolution import Resolved
@@ -248,3 +249,119 @@ def test_the_suite_also_has_scenes_of_2500_nodes_at_the_spacing_of_the_small_one
         small, large = cases[material], cases[f"{material}_2500"]
         assert (large.name, large.size, large.scene.spacing) == (small.name, small.size, small.scene.spacing)  # the same models take part
         assert initial_state(large, "test_unseen", 0).num_nodes == pytest.approx(2500, rel=0.02)
+
+
+def test_a_stopped_comparison_continues_scene_by_scene(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    settings, entrants = Settings({}, [], num_trajectories=3), {"model": Entrant(untrained(), Spent(0.0), "teacher")}
+    ran, stop_at = [], 2
+
+    def scene(spec: Any, index: int, *_: Any) -> list[dict[str, Any]]:
+        if index == stop_at:
+            raise KeyboardInterrupt
+        ran.append(index)
+        error = None if index == 1 else 1e-3
+        simulators = ((DATA, "solver"), ("model", "learned"))
+        return [{"order": None if index else 1.5}] + [
+            {"simulator": name, "family": family, "seconds": 1.0 + index, "mse": {"full": error}, "distance": error}
+            for name, family in simulators
+        ]
+
+    monkeypatch.setattr(module, "_scene", scene)
+    with pytest.raises(KeyboardInterrupt):
+        compare(spec, entrants, settings, tmp_path)
+    stop_at = -1
+    points, order = compare(spec, entrants, settings, tmp_path)
+    assert ran == [0, 1, 2] and order == 1.5
+    (model,) = (p for p in points if p.family == "learned")
+    assert (model.seconds, model.mse["full"], model.teacher) == ([1.0, 2.0, 3.0], [1e-3, float("inf"), 1e-3], "teacher")
+    compare(spec, entrants, replace(settings, factors=[2.5]), tmp_path)  # other solvers: nothing of the above counts
+    assert ran == [0, 1, 2, 0, 1, 2]
+
+
+def test_a_reference_is_computed_once_for_each_scene_and_solver(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES, "data.num_frames=4"))
+    solved = []
+
+    def generate(spec: Any, split: Any, index: int) -> Trajectory:
+        solved.append((spec.fine, index))
+        return generate_trajectory(spec, split, index)
+
+    monkeypatch.setattr("gpe_pl.benchmarks.reference_solutions.generate_trajectory", generate)
+    first, again = (stored_reference(spec, "test", 0, tmp_path / REFERENCES) for _ in range(2))
+    np.testing.assert_array_equal(first.pos, again.pos)
+    plain = generate_trajectory(replace(spec, fine=2), "test", 0)
+    np.testing.assert_allclose(first.pos, plain.pos, atol=1e-6)
+    stored_reference(spec, "test", 1, tmp_path / REFERENCES)
+    stored_reference(replace(spec, solver=replace(spec.solver, cfl=0.25)), "test", 0, tmp_path / REFERENCES)
+    stored_reference(spec, "test", 0, None)
+    assert solved == [(2, 0), (2, 1), (2, 0), (2, 0)]
+    with pytest.raises(ComparisonError, match="no solution at 1/8 of the spacing"):
+        stored_reference(replace(spec, fine=4), "test", 0, tmp_path)
+
+
+def test_models_of_other_labels_of_the_same_scenes_take_part(tmp_path: Path) -> None:
+    spec = dataset_spec(compose("simulate", "data=snow", "size=tiny", "data.fine=2"))
+    modulus = spec.solver.constants_of("snow").youngs_modulus  # type: ignore[attr-defined]
+
+    def finished(name: str, data: str, **config: Any) -> Run:
+        untrained().save(tmp_path / name / "checkpoints" / "best.ckpt")
+        keys = {"data.name": data, "size.name": "tiny", "model._target_": "GPE", "training.num_steps": 1}
+        return Run(tmp_path / name, keys | {f"data.{key}": value for key, value in config.items()}, table_of([]))
+
+    runs = [
+        finished("plain", "snow", fine=1),
+        finished("fine", "snow_fine2", fine=2),
+        finished("soft", "snow_fine2", fine=2, **{"solver.snow.youngs_modulus": modulus / 1.5}),
+        finished("finer", "snow_fine4", fine=4),
+        finished("other", "sand", fine=1),
+    ]
+    teachers = {label: e.teacher for label, e in _entrants(runs, spec, Settings({}, [], repeats=[])).items()}
+    assert teachers == {
+        "GPE 1 × 8": NODES,
+        "GPE 1 × 8, labels: spacing ÷ 2": DATA,
+        "GPE 1 × 8, labels: spacing ÷ 2 and moduli ÷ 1.5": f"{DATA}, moduli ÷ 1.5",
+    }
+    plain = _entrants(runs, replace(spec, name="snow", fine=1), Settings({}, [], repeats=[]))
+    assert {label: e.teacher for label, e in plain.items()} == {"GPE 1 × 8": DATA}
+
+
+def test_a_shipped_model_takes_part_in_the_case_of_its_data() -> None:
+    settings = Settings({}, [], repeats=[], checkpoints=["snow", "sand"])
+    small = dataset_spec(compose("simulate", "data=snow", "size=small"))
+    (label,) = _entrants([], small, settings)
+    assert label.endswith(", snow") and np.isnan(_entrants([], small, settings)[label].spent.training)
+    assert list(_entrants([], dataset_spec(compose("simulate", "data=snow", "size=small", "data.fine=2")), settings)) == [label]
+    assert not _entrants([], dataset_spec(compose("simulate", "data=snow", "size=tiny")), settings)
+
+
+def test_the_summary_names_the_nearest_model_and_what_it_lacks() -> None:
+    scenes = np.array([1.0, 10.0, 100.0, 3.0])
+
+    def of(name: str, cost: float, error: float, family: Family = "solver") -> Point:
+        return Point(name, family, [cost], {h: list(error * scenes) for h in ("20", "50")})
+
+    solvers = [of("cheap", 1.0, 4e-3), of("dear", 4.0, 1e-3)]
+    text = summary(
+        {
+            "won": [*solvers, of("good", 2.0, 1e-3, "learned"), of("bad", 2.0, 9e-3, "learned")],
+            "lost": [*solvers, of("slow", 4.0, 2e-3, "learned"), of("broken", 1.0, float("inf"), "learned")],
+        }
+    )
+    assert "| won | good | **0.50 [0.50, 0.50]** | **0.50 [0.50, 0.50]** | 0.5, 0.5 | **wins** |" in text
+    assert "| lost | slow | 2.00 [2.00, 2.00] | 2.00 [2.00, 2.00] | 2, 2 | loses at 2 of 2 |" in text
+
+
+def test_emulator_superiority_is_against_the_solver_of_the_labels() -> None:
+    scenes = [1.0, 2.0, 3.0]
+    data, teacher = (
+        Point(name, "solver", [cost], {"full": [f * s for s in scenes]}) for name, cost, f in ((DATA, 4.0, 1.0), (NODES, 1.0, 4.0))
+    )
+    model = Point("model", "learned", [1.0], {"full": [2 * s for s in scenes]}, teacher=NODES)
+    for p in (data, teacher, model):
+        p.distance = [1e-3]
+    text = section("snow", [data, teacher, model], 1.0, 3)
+    assert "| model | solver of its labels | **0.50 [0.50, 0.50]** |" in text
+    assert "solver of its labels): model (@full): the interval lies below 1." in text
+    model.teacher = DATA
+    assert "solver of its labels): no model is, at any horizon." in section("snow", [data, teacher, model], 1.0, 3)
