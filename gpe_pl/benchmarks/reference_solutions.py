@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ def stored_reference(spec: DatasetSpec, split: Split, index: int, folder: Path |
         raise ComparisonError(
             f"{spec.name}: the solver {spec.solver.name} has no solution at 1/{2 * spec.fine} of the spacing to compare with"
         )
-    finer: DatasetSpec = replace(spec, fine=2 * spec.fine)
+    finer = _with_labels(spec, 2 * spec.fine)
     if folder is None:
         return generate_trajectory(finer, split, index)
     scene = {"split": split, "index": index, "seed": scene_seed(spec, split, index), "values": parameter_values(spec, split, index)[0]}
@@ -54,6 +55,11 @@ def stored_reference(spec: DatasetSpec, split: Split, index: int, folder: Path |
     return read_trajectory(path, NAME, verify=True)
 
 
+def _with_labels(spec: DatasetSpec, fine: int) -> DatasetSpec:
+    settings: dict[str, Any] = {"fine": fine}
+    return replace(spec, **settings)
+
+
 def observed_order(spec: DatasetSpec, split: Split, index: int, reference: Trajectory) -> float:
     """Return the observed order P = log₂ (|u_2h − u_h| / |u_h − u_{h/2}|) over the first frames; NaN if there is no rollout with spacing 2h.
 
@@ -61,7 +67,7 @@ def observed_order(spec: DatasetSpec, split: Split, index: int, reference: Traje
     """
     few = generate_trajectory(spec, split, index, num_frames=min(FRAMES_OF_ORDER, spec.num_frames - 1) + 1)
     if spec.fine > 1:
-        coarse = generate_trajectory(replace(spec, fine=spec.fine // 2), split, index, num_frames=few.num_frames)
+        coarse = generate_trajectory(_with_labels(spec, spec.fine // 2), split, index, num_frames=few.num_frames)
     else:
         solver = coarser_solver(spec, 2.0)
         try:

@@ -246,7 +246,7 @@ def _scene(
     start = initial_state(spec, settings.split, index)
     history = generate_trajectory(replace(spec, fine=1), settings.split, index, num_frames=first + 1)
     truth = reference.frames(first)
-    seconds_of = {}
+    seconds_of: dict[str, float] = {}
     for name, family, simulator, at in _simulators(spec, start, history, entrants, first, settings):
         prediction, seconds = timed(simulator, at, reference, first)
         if family == "learned":

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from gpe_pl.benchmarks.solver_rungs import CONSTANT_MODULI
 from gpe_pl.data.ground_truth import DatasetSpec
@@ -75,9 +75,9 @@ class Labels:
 
 def labels_of(run: Run, spec: DatasetSpec) -> Labels:
     """Return how the labels of a run were solved, with moduli relative to those of ``spec``."""
-    ratios = []
-    for material in getattr(spec.solver, "materials", ()) if hasattr(spec.solver, "constants_of") else ():
-        constants: Any = spec.solver.constants_of(material)
+    ratios, solver = [], cast(Any, spec.solver)
+    for material in solver.materials if hasattr(solver, "constants_of") else ():
+        constants = solver.constants_of(material)
         for name in CONSTANT_MODULI:
             if hasattr(constants, name):
                 own = getattr(constants, name)
