@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
@@ -48,6 +49,15 @@ class UnrollStart:
         """Number of steps of the unroll."""
         return self.truth.shape[0] - 2
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields with arrays instead of tensors, for another process. Each tensor would need shared memory of its own, which takes longer."""
+        boundary = replace(self.state.boundary, **_arrays(self.state.boundary))
+        return vars(self) | _arrays(self) | {"state": replace(self.state, **_arrays(self.state), boundary=boundary)}
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        tensors = {name: torch.from_numpy(value) for name, value in values.items() if isinstance(value, np.ndarray)}
+        vars(self).update(values | tensors | {"state": values["state"].to_torch()})
+
     def target(self, state: State, step: int, dt: float) -> tuple[Tensor, Tensor | None]:
         """Return the target of the state that the model has reached after ``step`` steps: acceleration [m/s²] without gravity, and stress [Pa] if there is one.
 
@@ -75,6 +85,11 @@ class UnrollStart:
     def graph(self, builder: GraphBuilder, state: State, step: int) -> HeteroData:
         """Create the training graph of the state that the model has reached after ``step`` steps."""
         return training_graph(builder, state, *self.target(state, step, builder.metadata.frame_dt), self.about)
+
+
+def _arrays(part: Any) -> dict[str, Any]:
+    """Return the fields of a data class that are tensors, as arrays."""
+    return {name: value.numpy() for name, value in vars(part).items() if isinstance(value, Tensor)}
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -149,6 +150,19 @@ def test_weights_of_graphs_weigh_their_nodes(data: WindowDataset, simulator: Lea
     for graph, weight in zip(graphs, (0.5, 3.0), strict=True):
         graph.weight = weight
     assert float(module.loss(batched(graphs))) == pytest.approx(float(0.5 * losses[0] + 3.0 * losses[1]) / 2, rel=1e-5)
+
+
+def test_starts_reach_another_process_as_arrays(data: WindowDataset) -> None:
+    start = data[StartKey(0, 0, 2)]
+    sent = pickle.dumps(start)
+    assert b"torch" not in sent
+    received = pickle.loads(sent)
+    assert torch.equal(received.truth, start.truth) and received.stress is None and received.about == start.about
+    for ours, theirs in ((start.state, received.state), (start.state.boundary, received.state.boundary)):
+        for name, value in vars(ours).items():
+            if isinstance(value, torch.Tensor):
+                assert torch.equal(getattr(theirs, name), value) and getattr(theirs, name).dtype == value.dtype
+    assert_equal_graphs(received.graph(data.builder, received.state, 0), start.graph(data.builder, start.state, 0))
 
 
 def test_the_last_steps_are_unrolled() -> None:
