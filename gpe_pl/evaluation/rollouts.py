@@ -17,6 +17,8 @@ from gpe_pl.evaluation.predictions import SCENES_AT_ONCE, PredictedScene, Predic
 from gpe_pl.evaluation.rollout_cost import write_cost
 from gpe_pl.evaluation.scene_files import check_formats, write_error_curve, write_exports, write_parameter_picture, write_pictures
 from gpe_pl.evaluation.settings import EvaluationSettings
+from gpe_pl.export.play_model import check as check_page
+from gpe_pl.export.play_page import Film, write_page
 from gpe_pl.export.program import export_model
 from gpe_pl.graphs.batching import batched
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -78,14 +80,17 @@ def evaluate(
         StartError: ``settings.start_time`` leaves too little history, or is between frames.
         SceneError: the data do not fit the simulator.
         ExportError: a format in ``settings.export`` needs a package that is not installed.
+        PageError: ``settings.export`` has ``page``, which cannot compute the model.
     """
     frame_dt = simulator.builder.metadata.frame_dt
     start_frame = settings.first_frame(simulator.builder.config.history, frame_dt)
     check_formats(settings.export)
+    if "page" in settings.export:
+        check_page(simulator)
     simulator = simulator.configured(clamps_parameters=settings.clamp_parameters, static_friction=settings.static_friction)
     run_dir.mkdir(parents=True, exist_ok=True)
     predictor = Predictor(simulator, settings, label, controls, stride, start_frame, seconds=[])
-    rows: list[Row] = []
+    rows, films = list[Row](), list[Film]()
     for split in settings.splits:
         rows.append(Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split, stride=stride)))
         curves: dict[str, list[np.ndarray]] = {}
@@ -100,12 +105,15 @@ def evaluate(
             if number < settings.num_pictures:
                 write_pictures(run_dir, split, number, scene.truth, {label: scene.predictions[label]})
                 write_exports(run_dir, split, number, scene.truth, scene.predictions[label], settings.export)
+                films.append(Film(f"{split} {number}", scene.trajectory))
                 if scene.at_values:
                     write_parameter_picture(run_dir / f"parameters_{split}_{number:02d}.png", scene.at_values)
         if curves and settings.num_pictures:
             write_error_curve(run_dir / f"error_curve_{split}.png", curves, frame_dt)
     if "model" in settings.export:
         export_model(simulator, run_dir / "model.pt2")
+    if "page" in settings.export:
+        write_page(run_dir / "page", {label: simulator}, {label: films})
     write_cost(run_dir, predictor.seconds, frame_dt)
     write_rows(run_dir / "metrics.csv", rows)
     return rows

@@ -125,7 +125,12 @@ def _standards(simulator: LearnedSimulator, material: str) -> dict[str, Any]:
     for relation in simulator.builder.spec.relations:
         (mean, inverse), odd = own.even[relation], own.odd[relation]
         edges.append(listed((np.concatenate([np.zeros_like(odd), mean]), np.concatenate([odd, inverse]))))
-    return {"nodes": listed(own.node[material]), "boundary": listed(own.node[BOUNDARY]), "params": listed(own.params[material].statistics), "edges": edges}
+    return {
+        "nodes": listed(own.node[material]),
+        "boundary": listed(own.node[BOUNDARY]),
+        "params": listed(own.params[material].statistics),
+        "edges": edges,
+    }
 
 
 def _network(model: GPE, material: str, numbers: Numbers) -> dict[str, Any]:

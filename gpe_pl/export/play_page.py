@@ -68,7 +68,7 @@ def write_page(folder: Path | str, simulators: Mapping[str, LearnedSimulator], f
     folder = Path(folder)
     texts = {"play.js": bundled(), "play.css": (PARTS / "play.css").read_text(encoding="utf-8")}
     for name, simulator in simulators.items():
-        texts[f"{portable(name)}.js"] = _model_script(simulator, (films or {}).get(name, ()))
+        texts[f"{portable(name)}.js"] = _model_script(name, simulator, (films or {}).get(name, ()))
     scripts = "\n".join(f'<script src="{html.escape(portable(name))}.js"></script>' for name in simulators)
     parts = {"materials": html.escape(", ".join(simulators)), "models": scripts}
     page = (PARTS / "index.html").read_text(encoding="utf-8")
@@ -78,9 +78,9 @@ def write_page(folder: Path | str, simulators: Mapping[str, LearnedSimulator], f
     return folder / "index.html"
 
 
-def _model_script(simulator: LearnedSimulator, films: Sequence[Film]) -> str:
+def _model_script(name: str, simulator: LearnedSimulator, films: Sequence[Film]) -> str:
     about, numbers = model_for_page(simulator)
-    about |= {"weights": _base64(numbers), "scenes": [_scene(simulator, film) for film in films]}
+    about |= {"name": name, "weights": _base64(numbers), "scenes": [_scene(simulator, film) for film in films]}
     return f"(window.gpeModels ||= []).push({json.dumps(about, allow_nan=False)});\n"
 
 

@@ -23,7 +23,7 @@ class Page {
     this.behind = 0;
     this.counts = { steps: 0, since: performance.now(), cost: 0 };
     this.plot = new EnergyPlot($("energy"));
-    $("model").replaceChildren(...models.map((model, k) => new Option(model.material, k)));
+    $("model").replaceChildren(...models.map((model, k) => new Option(model.name, k)));
     $("model-row").hidden = models.length < 2;
     this.open(0);
     this.listen();

@@ -32,7 +32,7 @@ export class World {
     this.numBlocks = 0;
     if (scene) {
       this.shapes = scene.shapes.map((shape) => ({ ...shape }));
-      this.append(scene.count, { pos: scene.pos, vel: scene.vel, mass: scene.mass, history: scene.history });
+      this.append(scene.count, { pos: scene.pos, vel: scene.vel, mass: scene.mass, history: scene.history, params: scene.params });
       this.parameters = scene.params.slice(0, model.parameters.length);
     } else {
       this.shapes = boxWalls(model.bounds);
@@ -40,7 +40,6 @@ export class World {
       this.addBlock(0.25, 0.35, 0.22);
       this.addBlock(0.6, 0.68, 0.18);
     }
-    this.setParameters(this.parameters);
     this.resample();
   }
 
@@ -102,8 +101,8 @@ export class World {
       }
     }
     const count = pos.length / 2;
-    this.append(count, { pos, mass: new Float64Array(count).fill(model.nodeMass) });
-    this.setParameters(this.parameters);
+    const params = Array(count).fill(this.parameters).flat();
+    this.append(count, { pos, mass: new Float64Array(count).fill(model.nodeMass), params });
     this.untouched = false;
     return count;
   }

@@ -1,0 +1,203 @@
+"""The page to play with, in a browser and from a plain file server. Skipped without a browser."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpe_pl import play
+from gpe_pl.export.play_page import PARTS, Film, PageFolderError, bundled, write_page
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.rollout.baselines import Ballistic
+from gpe_pl.rollout.loop import rollout
+from tests.integration.test_play_steps import FLOOR, SIDE, scene
+from tests.integration.test_viewer_page import BROWSERS
+
+PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+NUM_FRAMES = 30
+
+
+def film(simulator: LearnedSimulator) -> Film:
+    """Return a film in which particles fly freely."""
+    metadata = simulator.builder.metadata
+    state = scene(simulator, (FLOOR, SIDE))
+    return Film("flight", rollout(Ballistic(metadata.frame_dt), state, simulator.builder.config.history + NUM_FRAMES, metadata))
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    folder = tmp_path_factory.mktemp("page")
+    simulator = LearnedSimulator.from_checkpoint("sand")
+    write_page(folder, {"sand": simulator, "other": simulator}, {"other": [film(simulator)]})
+    with play.server(folder, 0) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    with playwright.sync_playwright() as p:
+        if path is None and not Path(p.chromium.executable_path).exists():
+            pytest.skip(f"no browser is installed: none of {', '.join(BROWSERS)}, and none of playwright's own")
+        chromium = p.chromium.launch(executable_path=path)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def page(browser: Any, address: str, request: pytest.FixtureRequest) -> Iterator[Any]:
+    """An open page, paused. It requests nothing but its own files."""
+    context = browser.new_context(reduced_motion="reduce", **getattr(request, "param", {}))
+    opened, problems, requests = context.new_page(), list[str](), list[str]()
+    opened.on("pageerror", lambda error: problems.append(str(error)))
+    opened.on("console", lambda message: problems.append(message.text))
+    opened.on("request", lambda sent: requests.append(sent.url))
+    opened.goto(address)
+    opened.wait_for_function("window.gpePage")
+    yield opened
+    assert problems == []
+    assert all(url.startswith((address, "data:")) for url in requests)
+    context.close()
+
+
+def nodes(page: Any) -> np.ndarray:
+    """Return position and velocity of the particles [node, 4]."""
+    values = page.evaluate("[Array.from(gpePage.world.state.pos), Array.from(gpePage.world.state.vel)]")
+    return np.concatenate([np.reshape(v, (-1, 2)) for v in values], axis=1)
+
+
+def advance(page: Any, num_steps: int) -> None:
+    page.evaluate("count => { for (let k = 0; k < count; k++) gpePage.step(); }", num_steps)
+
+
+def pixel(page: Any, x: float, y: float) -> tuple[float, float]:
+    """Return the place on the screen of a point in metres."""
+    return page.evaluate(
+        """([x, y]) => { const p = gpePage.panel, box = p.canvas.getBoundingClientRect(); p.fit();
+        return [box.left + (p.x0 + p.scale * x) / p.density, box.top + (p.y0 - p.scale * y) / p.density]; }""",
+        [x, y],
+    )
+
+
+def test_blocks_fall_when_the_page_plays(page: Any) -> None:
+    assert page.locator("#rate").inner_text() in ("", "paused")  # the reader's system asks for reduced motion
+    before = nodes(page)
+    page.locator("#play").click()
+    page.wait_for_function("gpePage.world.time > 0.05")
+    page.locator("#play").click()
+    assert (nodes(page)[:, 1] < before[:, 1]).all()
+    page.wait_for_function("document.getElementById('kinetic').textContent !== '0.0 J'")
+
+
+@pytest.mark.parametrize("page", [{}, PHONE], indirect=True, ids=["desktop", "phone"])
+def test_everything_fits_and_buttons_are_large_enough(page: Any) -> None:
+    width = page.viewport_size["width"]
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert all(button.bounding_box()["height"] >= 40 for button in page.locator("button").all())
+
+
+def test_a_block_is_thrown_by_dragging(page: Any) -> None:
+    x, y = nodes(page)[:, :2].max(axis=0) - 0.08
+    held = np.hypot(*(nodes(page)[:, :2] - (x, y)).T) < 0.05
+    page.mouse.move(*pixel(page, x, y))
+    page.mouse.down()
+    page.mouse.move(*pixel(page, x - 0.3, y + 0.1))
+    advance(page, 10)
+    page.mouse.up()
+    assert "Thrown" in page.locator("#status").inner_text()
+    assert (nodes(page)[held, 2] < -0.5).all()
+    there = nodes(page)[held, 0]
+    advance(page, 5)
+    assert (nodes(page)[held, 0] < there).all()
+
+
+def test_the_keyboard_moves_an_obstacle(page: Any) -> None:
+    def center() -> list[float]:
+        return page.evaluate("gpePage.world.obstacles[0].center")
+
+    page.evaluate("gpePage.cursor = gpePage.world.obstacles[0].center")
+    page.locator("#stage").focus()
+    before = center()
+    page.keyboard.press("Space")
+    for _ in range(5):
+        page.keyboard.press("ArrowUp")
+    advance(page, 60)
+    page.keyboard.press("Space")
+    assert center()[1] == pytest.approx(before[1] + 0.1, abs=0.01)
+    assert center()[0] == pytest.approx(before[0], abs=0.01)
+
+
+def test_keys_add_remove_and_restart(page: Any) -> None:
+    count = len(nodes(page))
+    page.locator("#stage").focus()
+    for _ in range(4):
+        page.keyboard.press("Shift+ArrowUp")
+    page.keyboard.press("Shift+ArrowRight")
+    page.keyboard.press("b")
+    added = len(nodes(page))
+    assert added > count
+    page.keyboard.press("Delete")
+    assert len(nodes(page)) == count
+    page.keyboard.press("o")
+    assert page.evaluate("gpePage.world.obstacles.length") == 2
+    page.keyboard.press("r")
+    assert page.evaluate("gpePage.world.obstacles.length") == 1
+
+
+def test_the_slider_sets_the_parameter(page: Any) -> None:
+    page.locator("#parameter-0").fill("0")
+    low = LearnedSimulator.from_checkpoint("sand").get_buffer("trained_sand")[0, 0]
+    assert page.evaluate("gpePage.world.state.params[0]") == pytest.approx(float(low))
+    assert page.locator("#value-0").inner_text() == f"{float(low):.1f} °"
+
+
+def test_the_film_runs_beside_the_model(page: Any) -> None:
+    assert page.locator("#film-side").is_hidden()
+    page.locator("#model").select_option(label="other")
+    assert page.locator("#film-side").is_visible()
+    start = nodes(page)[:, :2]
+    first = page.evaluate("Array.from(gpePage.choice.frames.slice(0, 2 * gpePage.choice.count), v => v / 65535)")
+    np.testing.assert_allclose(np.reshape(first, (-1, 2)), start, atol=1e-4)
+    advance(page, NUM_FRAMES)
+    page.wait_for_function("document.getElementById('film-note').textContent === 'the film has ended'")
+
+
+def test_a_failed_model_stops_with_a_message(page: Any) -> None:
+    page.evaluate("gpePage.world.state.vel[0] = NaN")
+    advance(page, 2)
+    assert "failed" in page.locator("#status").inner_text()
+
+
+def test_the_script_names_every_part() -> None:
+    script = bundled()
+    assert all(f"gpe_{path.stem} = " in script for path in PARTS.glob("*.mjs"))
+    assert re.search(r"^(import|export) ", script, flags=re.MULTILINE) is None
+
+
+def test_a_page_without_models_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(PageFolderError, match="at least one model"):
+        write_page(tmp_path, {})
+
+
+def test_the_command_writes_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert play.main(["snow", "--folder", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "index.html")
+    assert '<script src="snow.js">' in (tmp_path / "index.html").read_text()
+
+
+def test_the_command_refuses_solids_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert play.main(["fem", "--folder", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "a model of meshes (solid)" in error
