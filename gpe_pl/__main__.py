@@ -11,6 +11,7 @@ from gpe_pl.system import early_interrupts
 
 VERBS: dict[str, tuple[str, str]] = {
     "demo": ("scenes.demo", "show a shipped model beside its solver in the browser"),
+    "play": ("scenes.play", "play with a model in the browser: drag, throw, slide its parameter"),
     "info": ("scenes.info", "print what a model was trained for, how accurate and how fast it is"),
     "simulate": ("simulate", "generate a data set with a solver"),
     "fit": ("fit", "train a model, evaluate it and write a report"),

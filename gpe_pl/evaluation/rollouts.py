@@ -15,11 +15,16 @@ from gpe_pl.evaluation.material_controls import MaterialControls
 from gpe_pl.evaluation.metric_rows import EXACT, LEARNED, Row, write_rows
 from gpe_pl.evaluation.predictions import SCENES_AT_ONCE, PredictedScene, Predictor
 from gpe_pl.evaluation.rollout_cost import write_cost
-from gpe_pl.evaluation.scene_files import check_formats, write_error_curve, write_exports, write_parameter_picture, write_pictures
+from gpe_pl.evaluation.scene_files import (
+    check_formats,
+    write_error_curve,
+    write_exports,
+    write_models,
+    write_parameter_picture,
+    write_pictures,
+)
 from gpe_pl.evaluation.settings import EvaluationSettings
-from gpe_pl.export.play_model import check as check_page
-from gpe_pl.export.play_page import Film, write_page
-from gpe_pl.export.program import export_model
+from gpe_pl.export.play_page import Film
 from gpe_pl.graphs.batching import batched
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
@@ -84,9 +89,7 @@ def evaluate(
     """
     frame_dt = simulator.builder.metadata.frame_dt
     start_frame = settings.first_frame(simulator.builder.config.history, frame_dt)
-    check_formats(settings.export)
-    if "page" in settings.export:
-        check_page(simulator)
+    check_formats(settings.export, simulator)
     simulator = simulator.configured(clamps_parameters=settings.clamp_parameters, static_friction=settings.static_friction)
     run_dir.mkdir(parents=True, exist_ok=True)
     predictor = Predictor(simulator, settings, label, controls, stride, start_frame, seconds=[])
@@ -110,10 +113,7 @@ def evaluate(
                     write_parameter_picture(run_dir / f"parameters_{split}_{number:02d}.png", scene.at_values)
         if curves and settings.num_pictures:
             write_error_curve(run_dir / f"error_curve_{split}.png", curves, frame_dt)
-    if "model" in settings.export:
-        export_model(simulator, run_dir / "model.pt2")
-    if "page" in settings.export:
-        write_page(run_dir / "page", {label: simulator}, {label: films})
+    write_models(run_dir, simulator, label, films, settings.export)
     write_cost(run_dir, predictor.seconds, frame_dt)
     write_rows(run_dir / "metrics.csv", rows)
     return rows

@@ -11,6 +11,10 @@ from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.material_controls import AtValue
 from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.evaluation.settings import Export
+from gpe_pl.export.play_model import check
+from gpe_pl.export.play_page import Film, write_page
+from gpe_pl.export.program import export_model
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.saving import save_figure
 
@@ -22,12 +26,15 @@ class ExportError(GpeError):
     """Raised when a requested export cannot be written; the message says what is missing."""
 
 
-def check_formats(formats: list[Export]) -> None:
+def check_formats(formats: list[Export], simulator: LearnedSimulator) -> None:
     """Check, before any rollout, that the formats can be written.
 
     Raises:
         ExportError: a format needs a package that is not installed.
+        PageError: a page cannot compute the simulator.
     """
+    if "page" in formats:
+        check(simulator)
     if "mp4" in formats and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ExportError(
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
@@ -77,6 +84,14 @@ def write_exports(run_dir: Path, split: str, number: int, truth: Trajectory, pre
             write_npz(stem.with_suffix(".npz"), trajectory)
     if "mp4" in formats:
         write_animation(stem.with_suffix(".mp4"), truth, {LEARNED: prediction}, fps=20, stride=max(1, truth.num_frames // 200))
+
+
+def write_models(run_dir: Path, simulator: LearnedSimulator, label: str, films: list[Film], formats: list[Export]) -> None:
+    """Write the simulator to ``run_dir`` in those of the ``formats`` that hold it. A page calls it ``label`` and shows the films."""
+    if "model" in formats:
+        export_model(simulator, run_dir / "model.pt2")
+    if "page" in formats:
+        write_page(run_dir / "page", {label: simulator}, {label: films})
 
 
 def write_error_curve(path: Path, curves: dict[str, list[np.ndarray]], frame_dt: float) -> None:

@@ -15,4 +15,9 @@ def has_desktop() -> bool:
 
 def open_page(path: Path) -> bool:
     """Open a page in a browser; returns whether one was found."""
-    return has_desktop() and webbrowser.open(path.resolve().as_uri())
+    return open_address(path.resolve().as_uri())
+
+
+def open_address(address: str) -> bool:
+    """Open an address in a browser; returns whether one was found."""
+    return has_desktop() and webbrowser.open(address)

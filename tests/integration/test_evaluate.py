@@ -16,6 +16,7 @@ from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.data.ground_truth import trajectory_metadata
 from gpe_pl.evaluate import evaluate_checkpoint
 from gpe_pl.evaluation.metric_rows import Row, read_rows
+from gpe_pl.export.play_model import PageError
 from gpe_pl.files.run_folder import RunError
 from gpe_pl.fit import fit
 from gpe_pl.graphs.builder import GraphBuilder
@@ -162,8 +163,25 @@ def test_film_and_model_are_exported_on_request(tiny_data: Path, tmp_path: Path)
     assert (folder / "rollout_test_unseen_00.mp4").stat().st_size > 1000 and torch.export.load(folder / "model.pt2")
 
 
+@pytest.mark.slow
+def test_a_page_is_exported_with_films_of_the_solver(tiny_data: Path, tmp_path: Path) -> None:
+    simulator = untrained()
+    simulator.model = GPE(simulator.builder.spec, num_message_passing_steps=1, hidden_channels=8, edge_state="geometry")
+    simulator.save(tmp_path / "own.ckpt")
+    evaluate(tiny_data, tmp_path, tmp_path / "own.ckpt", "evaluation.num_pictures=2", "evaluation.export=[page]")
+    folder = tmp_path / "evaluation_test_unseen" / "page"
+    assert {path.name for path in folder.iterdir()} == {"index.html", "play.css", "play.js", "learned.js"}
+    assert (folder / "learned.js").read_text().count('"numFrames"') == 2
+
+
+def test_a_page_of_another_model_is_refused_before_the_rollouts(tiny_data: Path, tmp_path: Path) -> None:
+    untrained().save(tmp_path / "own.ckpt")
+    with pytest.raises(PageError, match="model.edge_state=latent"):
+        evaluate(tiny_data, tmp_path, tmp_path / "own.ckpt", "evaluation.export=[page]")
+
+
 def test_an_unknown_format_is_refused(tiny_data: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"evaluation\.export\.0='vtu': must be 'vtk', 'npz', 'mp4' or 'model'"):
+    with pytest.raises(ConfigError, match=r"evaluation\.export\.0='vtu': must be 'vtk', 'npz', 'mp4', 'model' or 'page'"):
         evaluate(tiny_data, tmp_path, "x.ckpt", "evaluation.export=[vtu]")
 
 

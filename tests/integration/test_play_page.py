@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import re
 import shutil
 import threading
@@ -12,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gpe_pl import play
 from gpe_pl.export.play_page import PARTS, Film, PageFolderError, bundled, write_page
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.baselines import Ballistic
 from gpe_pl.rollout.loop import rollout
+from gpe_pl.scenes import play
 from tests.integration.test_play_steps import FLOOR, SIDE, scene
 from tests.integration.test_viewer_page import BROWSERS
 
@@ -191,13 +193,42 @@ def test_a_page_without_models_is_refused(tmp_path: Path) -> None:
         write_page(tmp_path, {})
 
 
-def test_the_command_writes_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert play.main(["snow", "--folder", str(tmp_path)]) == 0
+def test_the_command_writes_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["gpe play", "snow", f"folder={tmp_path}"])
+    play.main()
     assert capsys.readouterr().out.strip() == str(tmp_path / "index.html")
     assert '<script src="snow.js">' in (tmp_path / "index.html").read_text()
 
 
-def test_the_command_refuses_solids_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert play.main(["fem", "--folder", str(tmp_path)]) == 1
+@pytest.mark.slow
+def test_the_command_films_the_solver(tmp_path: Path) -> None:
+    play.write(tmp_path, ["snow"], 1)
+    about = json.loads((tmp_path / "snow.js").read_text().partition("push(")[2].rpartition(")")[0])
+    (scene,) = about["scenes"]
+    assert scene["numFrames"] == play.NUM_FRAMES + 1
+    film = np.frombuffer(base64.b64decode(scene["film"]), "<u2").reshape(scene["numFrames"], scene["count"], 2)
+    np.testing.assert_allclose(film[0] / 65535, np.reshape(scene["pos"], (-1, 2)), atol=1e-4)
+    assert film[-1, :, 1].mean() < film[0, :, 1].mean()  # it has fallen
+
+
+@pytest.mark.parametrize(
+    ("arguments", "answer"),
+    [
+        (["fem"], "a model of meshes (solid)"),
+        (["sandd"], "did you mean 'sand'"),
+        (["sand", "film=1"], "did you mean 'films'"),
+    ],
+)
+def test_the_command_refuses_in_one_line(
+    arguments: list[str], answer: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["gpe play", *arguments, f"folder={tmp_path}"])
+    with pytest.raises(SystemExit):
+        play.main()
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "a model of meshes (solid)" in error
+    assert error.count("\n") == 1 and answer in error
+
+
+def test_a_port_in_use_is_refused(tmp_path: Path) -> None:
+    with play.server(tmp_path, 0) as first, pytest.raises(play.PortFault, match="port=0 for any free one"):
+        play.server(tmp_path, first.server_address[1])
