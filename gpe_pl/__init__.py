@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from gpe_pl.export.trajectories import write_npz as write_npz
     from gpe_pl.export.trajectories import write_vtk as write_vtk
     from gpe_pl.geometry.shapes import domain_walls as domain_walls
+    from gpe_pl.learned.banded import roll_out_with_bands as roll_out_with_bands
+    from gpe_pl.learned.bands import read as read_bands  # noqa: F401
+    from gpe_pl.learned.ensemble import LearnedEnsemble as LearnedEnsemble
     from gpe_pl.learned.simulator import LearnedSimulator as LearnedSimulator
     from gpe_pl.metrics.rollouts import rollout_metrics as rollout_metrics
     from gpe_pl.rollout.containment import Contained as Contained
@@ -50,6 +53,7 @@ _MODULES = {
     "Boundary": "trajectory.boundary",
     "Contained": "rollout.containment",
     "GpeError": "errors",
+    "LearnedEnsemble": "learned.ensemble",
     "LearnedSimulator": "learned.simulator",
     "Metadata": "trajectory.trajectory",
     "State": "trajectory.state",
@@ -59,8 +63,10 @@ _MODULES = {
     "export_model": "export.program",
     "generate_trajectory": "data.ground_truth",
     "iter_trajectories": "trajectory.store",
+    "read_bands": "learned.bands",
     "read_trajectory": "trajectory.store",
     "roll_out": "rollout.loop",
+    "roll_out_with_bands": "learned.banded",
     "rollout_figure": "viz.figures",
     "rollout_metrics": "metrics.rollouts",
     "save_dataset": "data.importers.assemble",
@@ -69,7 +75,7 @@ _MODULES = {
     "write_viewer": "viz.viewer",
     "write_vtk": "export.trajectories",
 }
-_NAMES_THERE = {"roll_out": "rollout"}
+_NAMES_THERE = {"read_bands": "read", "roll_out": "rollout"}
 
 __all__ = [*_MODULES]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from hashlib import sha256
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,8 @@ if TYPE_CHECKING:
 def evaluate_checkpoint(cfg: DictConfig) -> None:
     """Roll a trained model out on one split of a data set, and in the data set's showcase if it has one. Results go to ``{paths.runs}/{name}``.
 
-    A split that is missing is generated first. The first printed line says which acceptance checks and stress tests the model fails.
+    A split that is missing is generated first. The first printed line says which acceptance checks and stress tests the model fails. Several checkpoints are
+    evaluated as one ensemble. With ``calibrate``, error bands are stored beside the first checkpoint; without, their coverage is measured.
     """
     from gpe_pl.config.datasets import (
         check_material_controls,
@@ -36,12 +38,13 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         scene_metadata,
         stride_of,
     )
+    from gpe_pl.data.checksum import split_checksum
     from gpe_pl.evaluation.rollouts import evaluate
     from gpe_pl.evaluation.settings import EvaluationSettings
+    from gpe_pl.evaluation.uncertainty import Uncertainty
     from gpe_pl.files.names import run_name
     from gpe_pl.files.run_folder import claim, release, without_orphans
-    from gpe_pl.learned.pretrained import names
-    from gpe_pl.learned.simulator import LearnedSimulator
+    from gpe_pl.learned.ensemble import LearnedEnsemble
     from gpe_pl.learned.verdicts import headline
     from gpe_pl.reports.sweep_table import conclusion, report_evaluation
     from gpe_pl.rollout.skips import Skips
@@ -49,11 +52,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.system.provenance import recorded
     from gpe_pl.training.run import TrainerSettings, set_up
 
-    if not isinstance(cfg.checkpoint, str):
-        shipped = f", or a shipped model: {', '.join(names())}" if names() else ""
-        raise ConfigError(f"checkpoint={cfg.checkpoint!r}: name the folder of a run, such as runs/sand, or a checkpoint{shipped}")
-    if cfg.split not in SPLITS:
-        raise ConfigError(f"split={cfg.split}: must be one of {', '.join(SPLITS)}{did_you_mean(str(cfg.split), SPLITS)}")
+    checkpoints = _checkpoints(cfg)
     if cfg.evaluation.data or list(cfg.evaluation.splits) != [cfg.split]:
         raise ConfigError("evaluation.data, evaluation.splits: are keys of fit; evaluate takes data=… and split=…, one split in each run")
     settings = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
@@ -61,9 +60,11 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     check_splits(evaluated, [cfg.split], "split")
     check_material_controls(cfg, settings)
     device = set_up(construct(TrainerSettings, cfg.trainer, "trainer"))
-    simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint, device)
-    simulator.skips = construct(Skips, cfg.rollout, "rollout")
-    print(headline(cfg.checkpoint), flush=True)
+    ensemble = LearnedEnsemble.from_checkpoints(checkpoints, device)
+    simulator = ensemble.members[0]
+    for checkpoint, member in zip(checkpoints, ensemble.members, strict=True):
+        member.skips = construct(Skips, cfg.rollout, "rollout")
+        print(headline(checkpoint), flush=True)
     scene = scene_metadata(evaluated, cfg.split)
     if not simulator.fits(scene):
         stride = simulator.stride_on(scene_metadata(evaluated, cfg.split, strided=False))
@@ -77,7 +78,11 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
             try:
                 start_frame = settings.first_frame(simulator.builder.config.history, scene.frame_dt)
                 controls = material_controls(cfg, settings, root, start_frame)
-                evaluate(simulator, root, settings, folder, controls=controls, stride=stride_of(evaluated))
+                uncertainty = Uncertainty(checkpoints, simulator, settings, cfg.split, split_checksum(root, cfg.split), cfg.calibrate)
+                evaluated_model = ensemble if len(checkpoints) > 1 else simulator
+                stride = stride_of(evaluated)
+                evaluate(evaluated_model, root, settings, folder, controls=controls, stride=stride, see=uncertainty.see)
+                uncertainty.finish(folder)
             finally:
                 release(folder)
         report_evaluation(folder)
@@ -87,19 +92,56 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     print(folder)
 
 
+def _checkpoints(cfg: DictConfig) -> list[str]:
+    """Return the checkpoints that the settings name.
+
+    Raises:
+        ConfigError: there are none, or settings do not fit several checkpoints or calibration.
+    """
+    from gpe_pl.learned.pretrained import names
+
+    given = (
+        [cfg.checkpoint]
+        if isinstance(cfg.checkpoint, str)
+        else list(cfg.checkpoint or [])
+        if not isinstance(cfg.checkpoint, int | float)
+        else []
+    )
+    if not given or not all(isinstance(checkpoint, str) for checkpoint in given):
+        shipped = f", or a shipped model: {', '.join(names())}" if names() else ""
+        raise ConfigError(
+            f"checkpoint={cfg.checkpoint!r}: name the folder of a run, such as runs/sand, or a checkpoint{shipped}; or several, as [a,b]"
+        )
+    if len(given) > 1 and cfg.data.get("showcase") is not None:
+        raise ConfigError("data.showcase: rolls out a single model; choose data.showcase=null, or one checkpoint")
+    if cfg.split not in SPLITS:
+        raise ConfigError(f"split={cfg.split}: must be one of {', '.join(SPLITS)}{did_you_mean(str(cfg.split), SPLITS)}")
+    if cfg.calibrate not in (True, False):
+        raise ConfigError(f"calibrate={cfg.calibrate!r}: must be true or false")
+    if cfg.calibrate and cfg.split == "train":
+        raise ConfigError("calibrate=true: needs scenes that the model was not trained on; choose another split than train")
+    return given
+
+
 def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
     """Return the settings and checksums on which the metrics of an evaluation depend. If one of them differs, the evaluation needs another folder."""
     from omegaconf import OmegaConf
 
     from gpe_pl.data.checksum import split_checksum
     from gpe_pl.files.run_folder import DATA_CHECKSUMS
+    from gpe_pl.learned.bands import path_beside
     from gpe_pl.learned.pretrained import fingerprint
 
+    checkpoints = _checkpoints(cfg)
+    prints = [fingerprint(checkpoint) for checkpoint in checkpoints]
+    beside = path_beside(checkpoints)
+    bands = {"calibrate": True} if cfg.calibrate else {"bands": sha256(beside.read_bytes()).hexdigest()[:12]} if beside.is_file() else {}
     values: Any = OmegaConf.to_container(cfg, resolve=True)
     without = ("splits", "data", "num_pictures", "export")  # do not change the metrics
     evaluation = {key: value for key, value in values["evaluation"].items() if key not in without}
     return {
-        "checkpoint": fingerprint(cfg.checkpoint),
+        "checkpoint": prints[0] if len(prints) == 1 else prints,
+        **bands,
         "split": cfg.split,
         DATA_CHECKSUMS: {cfg.split: split_checksum(root, cfg.split)},
         "evaluation": evaluation,

@@ -16,10 +16,13 @@ from gpe_pl.evaluation.rollout_cost import Timed
 from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.geometry.shapes import surface_tolerance
 from gpe_pl.learned.approximate import approximate
+from gpe_pl.learned.ensemble import LearnedEnsemble, combined, members_of
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.unlike import Watch
 from gpe_pl.metrics import per_frame_mse
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.ensemble import spread
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Simulator, Start, fraction_outside, rollout, rollouts
 from gpe_pl.schema import RADIUS, Split
@@ -44,6 +47,8 @@ class PredictedScene:
         counts: metrics of the learned rollout that need more than its positions, by name (see ``rollouts.evaluate``).
         solver_runs: runs of the solver with other parameters, by label, each with the trajectory that it is compared with.
         at_values: the scene at three values of its parameters, if a picture shows them; else empty.
+        spread: spread of the ensemble's members in each frame of the learned rollout [frame, node] in m; None for a single model.
+        features: ranges of the quantities that tell whether a scene is unlike others (see ``learned.unlike``).
     """
 
     trajectory: Trajectory
@@ -52,6 +57,8 @@ class PredictedScene:
     counts: dict[str, float]
     solver_runs: dict[str, tuple[Trajectory, Trajectory]]
     at_values: list[AtValue]
+    spread: np.ndarray | None
+    features: dict[str, tuple[float, float]]
 
 
 @dataclass
@@ -59,7 +66,7 @@ class Predictor:
     """Rolls out the scenes of a split.
 
     Attributes:
-        simulator: trained simulator.
+        simulator: trained simulator, or several as an ensemble.
         settings: what to evaluate.
         label: name of the model.
         controls: prepared controls of scenes with unseen parameters.
@@ -68,7 +75,7 @@ class Predictor:
         seconds: processor time per scene of each step so far [s].
     """
 
-    simulator: LearnedSimulator
+    simulator: LearnedSimulator | LearnedEnsemble
     settings: EvaluationSettings
     label: str
     controls: MaterialControls | None
@@ -87,22 +94,31 @@ class Predictor:
 
     def _batch(self, trajectories: list[Trajectory], first: int, controls: MaterialControls | None) -> Iterator[PredictedScene]:
         """Roll several scenes out at once. ``first`` is the number of the first one in its split."""
+        members, dt = members_of(self.simulator), trajectories[0].metadata.frame_dt
         truths = [trajectory.frames(self.start_frame) for trajectory in trajectories]
         starts = [start_of(self.simulator, self.start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
         totals = [{"num_corrected": 0.0, "num_asleep": 0.0, "lost_impulse": 0.0} for _ in starts]
+        spreads = [[np.zeros(truth.num_nodes)] for truth in truths]
+        watches = [Watch(members[0], start.num_steps) for start in starts]
+        for watch, own in zip(watches, starts, strict=True):
+            watch.see(0, own.state)
 
-        def count(scene: int, _: int, state: State) -> None:
+        def count(scene: int, frame: int, state: State) -> None:
+            watches[scene].see(frame, state)
             for name in totals[scene]:
                 totals[scene][name] += getattr(state, name)
+            if len(members) > 1:
+                spreads[scene].append(np.asarray(spread(state)))
 
         def within_walls(inner: Simulator) -> Simulator:
-            return Contained(inner, truths[0].metadata.frame_dt) if self.settings.containment else inner
+            return Contained(inner, dt) if self.settings.containment else inner
 
-        runner = approximate(self.simulator)
-        predicted = rollouts(Timed(within_walls(runner), self.seconds), starts, count)
-        free = self._uncontained(runner, starts, first) if self.settings.containment else predicted
-        exact = None if runner is self.simulator else rollouts(within_walls(self.simulator), starts)
-        others = None if controls is None else controls.predictions(within_walls(runner), starts, first)
+        runner = combined(members, lambda member: within_walls(approximate(member)))
+        predicted = rollouts(Timed(runner, self.seconds), starts, count)
+        free = self._uncontained(combined(members, approximate), starts, first) if self.settings.containment else predicted
+        is_exact = all(approximate(member) is member for member in members)
+        exact = None if is_exact else rollouts(combined(members, within_walls), starts)
+        others = None if controls is None else controls.predictions(runner, starts, first)
         for scene, (trajectory, truth) in enumerate(zip(trajectories, truths, strict=True)):
             prediction, number = predicted[scene], first + scene
             predictions = {self.label: prediction} if exact is None else {self.label: prediction, EXACT: exact[scene]}
@@ -116,9 +132,10 @@ class Predictor:
                 counts |= _cost_of_skipping(prediction, exact[scene], totals[scene])
             at_values: list[AtValue] = []
             if controls is not None and number < self.settings.num_pictures:
-                at_values = controls.at_three_values(within_walls(runner), starts[scene], number, truth, prediction)
+                at_values = controls.at_three_values(runner, starts[scene], number, truth, prediction)
             solver_runs = {} if controls is None else controls.solver_runs(number, truth)
-            yield PredictedScene(trajectory, truth, predictions, counts, solver_runs, at_values)
+            spread_of = np.stack(spreads[scene]) if len(members) > 1 else None
+            yield PredictedScene(trajectory, truth, predictions, counts, solver_runs, at_values, spread_of, watches[scene].found)
 
     def _uncontained(self, runner: Simulator, starts: list[Start], first: int) -> list[Trajectory]:
         """Roll out those of the scenes without containment that ``settings.num_uncontained`` includes."""
@@ -129,7 +146,10 @@ class Predictor:
         self, trajectory: Trajectory, truth: Trajectory, prediction: Trajectory, free: Trajectory | None, totals: dict[str, float]
     ) -> dict[str, float]:
         """Return counts of a learned rollout. ``free`` is the rollout without containment, if there is one."""
-        counts = {"num_good_frames": float(prediction.num_frames - 1), "edges_per_node": _edges_per_node(self.simulator, trajectory)}
+        counts = {
+            "num_good_frames": float(prediction.num_frames - 1),
+            "edges_per_node": _edges_per_node(members_of(self.simulator)[0], trajectory),
+        }
         if truth.boundary.shapes:  # a boundary of nodes alone has no inside
             steps = truth.num_frames - 1
             counts["fraction_outside_at_end"] = _fraction_outside(
@@ -141,7 +161,7 @@ class Predictor:
         return counts
 
 
-def start_of(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:
+def start_of(simulator: LearnedSimulator | LearnedEnsemble, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:
     """Return the start of a rollout, with a guard whose limits are far beyond the ground truth.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from gpe_pl.evaluation.scene_files import (
 from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.export.play_page import Film
 from gpe_pl.graphs.batching import batched
+from gpe_pl.learned.ensemble import LearnedEnsemble, configured, members_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.rollout.baselines import BASELINES
@@ -35,16 +36,20 @@ from gpe_pl.trajectory.trajectory import Trajectory
 log = logging.getLogger(__name__)
 
 ONE_STEP_WINDOWS = 256
+About = tuple[str, int, str, float]
+"""Split, number, parameter group and parameter of a scene, as in ``Row``."""
+See = Callable[[PredictedScene, About], Iterable[Row]]
 
 
 def evaluate(
-    simulator: LearnedSimulator,
+    simulator: LearnedSimulator | LearnedEnsemble,
     root: Path,
     settings: EvaluationSettings,
     run_dir: Path,
     label: str = LEARNED,
     controls: MaterialControls | None = None,
     stride: int = 1,
+    see: See | None = None,
 ) -> list[Row]:
     """Roll out every trajectory of the splits, and write metrics and pictures to ``run_dir``.
 
@@ -70,13 +75,14 @@ def evaluate(
       rollout without these levels is then evaluated, too.
 
     Args:
-        simulator: trained simulator.
+        simulator: trained simulator, or several as an ensemble.
         root: folder of the data set.
         settings: what to evaluate.
         run_dir: folder for the files.
         label: name of the model in the rows.
         controls: prepared controls of scenes with unseen parameters.
         stride: number of stored frames in a frame of the simulator.
+        see: called for each scene after its rollouts, with its split, number, parameter group and parameter. The rows that it returns are added.
 
     Returns:
         The rows of ``metrics.csv``.
@@ -87,10 +93,11 @@ def evaluate(
         ExportError: a format in ``settings.export`` needs a package that is not installed.
         PageError: ``settings.export`` has ``page``, which cannot compute the model.
     """
-    frame_dt = simulator.builder.metadata.frame_dt
-    start_frame = settings.first_frame(simulator.builder.config.history, frame_dt)
+    first = members_of(simulator)[0]
+    frame_dt = first.builder.metadata.frame_dt
+    start_frame = settings.first_frame(first.builder.config.history, frame_dt)
     check_formats(settings.export, simulator)
-    simulator = simulator.configured(clamps_parameters=settings.clamp_parameters, static_friction=settings.static_friction)
+    simulator = configured(simulator, clamps_parameters=settings.clamp_parameters, static_friction=settings.static_friction)
     run_dir.mkdir(parents=True, exist_ok=True)
     predictor = Predictor(simulator, settings, label, controls, stride, start_frame, seconds=[])
     rows, films = list[Row](), list[Film]()
@@ -101,27 +108,33 @@ def evaluate(
             stop = scene.predictions[label].termination
             if stop is not None:
                 log.warning("%s %d stopped: %s, %s", split, number, stop.reason, stop.message)
-            rows += _rows(scene, split, number, label, labels(settings.horizons, frame_dt))
+            about = (split, number, scene.truth.metadata.parameter_group, _parameter(scene.trajectory))
+            rows += _rows(scene, about, label, labels(settings.horizons, frame_dt))
+            rows += see(scene, about) if see else []
             for model, prediction in scene.predictions.items():
                 if model in (label, EXACT, *BASELINES):
                     curves.setdefault(model, []).append(per_frame_mse(prediction, scene.truth))
             if number < settings.num_pictures:
-                write_pictures(run_dir, split, number, scene.truth, {label: scene.predictions[label]})
-                write_exports(run_dir, split, number, scene.truth, scene.predictions[label], settings.export)
+                _draw(run_dir, scene, split, number, label, settings)
                 films.append(Film(f"{split} {number}", scene.trajectory))
-                if scene.at_values:
-                    write_parameter_picture(run_dir / f"parameters_{split}_{number:02d}.png", scene.at_values)
         if curves and settings.num_pictures:
             write_error_curve(run_dir / f"error_curve_{split}.png", curves, frame_dt)
-    write_models(run_dir, simulator, label, films, settings.export)
+    write_models(run_dir, members_of(simulator)[0], label, films, settings.export)
     write_cost(run_dir, predictor.seconds, frame_dt)
     write_rows(run_dir / "metrics.csv", rows)
     return rows
 
 
-def _rows(scene: PredictedScene, split: str, number: int, label: str, horizons: dict[int, str]) -> Iterator[Row]:
+def _draw(run_dir: Path, scene: PredictedScene, split: str, number: int, label: str, settings: EvaluationSettings) -> None:
+    """Write pictures and exports of a scene."""
+    write_pictures(run_dir, split, number, scene.truth, {label: scene.predictions[label]})
+    write_exports(run_dir, split, number, scene.truth, scene.predictions[label], settings.export)
+    if scene.at_values:
+        write_parameter_picture(run_dir / f"parameters_{split}_{number:02d}.png", scene.at_values)
+
+
+def _rows(scene: PredictedScene, about: About, label: str, horizons: dict[int, str]) -> Iterator[Row]:
     """Yield the metrics of a scene. ``horizons`` has labels by the number of frames."""
-    about = (split, number, scene.truth.metadata.parameter_group, _parameter(scene.trajectory))
     compared = {model: (prediction, scene.truth) for model, prediction in scene.predictions.items()} | scene.solver_runs
     for model, (prediction, reference) in compared.items():
         for record in rollout_metrics(prediction, reference, [*horizons, "full"]):
@@ -140,20 +153,28 @@ def _parameter(trajectory: Trajectory) -> float:
     return float(values[0]) if len(values) == 1 else float("nan")
 
 
-def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS, stride: int = 1) -> float:
+def one_step_nmse(
+    simulator: LearnedSimulator | LearnedEnsemble, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS, stride: int = 1
+) -> float:
     """Return the normalised one-step error without noise (``metrics.OneStepNMSE``), over windows spread evenly over a split. Predicting free fall gives 1.
+
+    The prediction of an ensemble is the mean over its members.
 
     Raises:
         SceneError: every ``stride``-th frame of the data does not fit the simulator.
     """
     views = every(usable(open_split(root, split)), stride)
-    simulator.check_scene(views[0].window(0, 1).metadata)
-    dataset = WindowDataset(views, simulator.builder)
-    windows = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), num_windows)).round().astype(int))
+    members = members_of(simulator)
+    members[0].check_scene(views[0].window(0, 1).metadata)
+    datasets = [WindowDataset(views, member.builder) for member in members]
+    windows = np.unique(np.linspace(0, len(datasets[0]) - 1, min(len(datasets[0]), num_windows)).round().astype(int))
     metric = OneStepNMSE()
     with torch.inference_mode():
         for chosen in np.array_split(windows, -(-len(windows) // SCENES_AT_ONCE)):
-            data = batched([dataset[int(window)] for window in chosen])
-            for material, value in simulator(data).acceleration.items():
-                metric.update(value, data[material].target / simulator.acceleration_std.float())
+            batches = [batched([dataset[int(window)] for window in chosen]) for dataset in datasets]
+            predicted = [member(data).acceleration for member, data in zip(members, batches, strict=True)]
+            unit = members[0].acceleration_std.float()
+            for material in predicted[0]:
+                values = [own[material] * (member.acceleration_std.float() / unit) for own, member in zip(predicted, members, strict=True)]
+                metric.update(torch.stack(values).mean(dim=0), batches[0][material].target / unit)
     return float(metric.compute())

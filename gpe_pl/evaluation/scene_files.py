@@ -14,6 +14,7 @@ from gpe_pl.evaluation.settings import Export
 from gpe_pl.export.play_model import check
 from gpe_pl.export.play_page import Film, write_page
 from gpe_pl.export.program import export_model
+from gpe_pl.learned.ensemble import LearnedEnsemble
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.saving import save_figure
@@ -26,14 +27,18 @@ class ExportError(GpeError):
     """Raised when a requested export cannot be written; the message says what is missing."""
 
 
-def check_formats(formats: list[Export], simulator: LearnedSimulator) -> None:
+def check_formats(formats: list[Export], simulator: LearnedSimulator | LearnedEnsemble) -> None:
     """Check, before any rollout, that the formats can be written.
 
     Raises:
-        ExportError: a format needs a package that is not installed.
+        ExportError: a format needs a package that is not installed, or takes a single model and the simulator is an ensemble.
         PageError: a page cannot compute the simulator.
     """
-    if "page" in formats:
+    single = [kind for kind in ("model", "page") if kind in formats]
+    if isinstance(simulator, LearnedEnsemble):
+        if single:
+            raise ExportError(f"evaluation.export: {single[0]} takes a single checkpoint; leave it out, or evaluate one checkpoint")
+    elif "page" in formats:
         check(simulator)
     if "mp4" in formats and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ExportError(

@@ -99,6 +99,51 @@ def test_the_folder_is_named_after_model_and_data(tmp_path: Path) -> None:
     assert canyons == ["evaluation_fluid_fluid_canyon_test", "evaluation_fluid_fluid_canyon_recorded_test"]  # one may follow the other
 
 
+def test_several_checkpoints_are_one_ensemble_by_name(tmp_path: Path) -> None:
+    assert compose("evaluate", "checkpoint=[sand,other]").name == "evaluation_sand_ensemble_of_2_sand_test"
+    assert compose("evaluate", "checkpoint=[sand]").name == "evaluation_sand_sand_test"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["checkpoint=null"], "name the folder of a run"),
+        (["checkpoint=[]"], "name the folder of a run"),
+        (["checkpoint=[sand,2]"], "name the folder of a run"),
+        (["checkpoint=[fluid,fluid]", "data=fluid", "scene=canyon"], "data.showcase: rolls out a single model"),
+        (["checkpoint=sand", "calibrate=maybe"], "must be true or false"),
+        (["checkpoint=sand", "calibrate=true", "split=train"], "not trained on"),
+    ],
+)
+def test_checkpoints_and_calibration_that_make_no_sense_are_refused(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        evaluate_checkpoint(compose("evaluate", *overrides))
+
+
+@pytest.mark.slow
+def test_an_ensemble_is_calibrated_and_its_coverage_measured(tiny_data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    fit(tiny(tiny_data, tmp_path))
+    run = tmp_path / "fit"
+    checkpoints = f"[{run},{run}/checkpoints/last.ckpt]"
+    more = ["data.name=more", "++data.sizes.tiny.num_test=10", "split=test", "evaluation.num_pictures=0"]
+    rows = evaluate(tmp_path / "data", tmp_path, checkpoints, *more, "calibrate=true")
+    assert not [row for row in rows if row.metric == "fraction_in_bands"]
+    assert (run / "checkpoints" / "best.ensemble_of_2.bands.json").exists()
+    shutil.rmtree(tmp_path / "evaluation_test_unseen")
+    rows = evaluate(tiny_data, tmp_path, checkpoints, "evaluation.num_pictures=0")
+    inside = [row.value for row in rows if row.metric == "fraction_in_bands" and row.horizon == "full"]
+    assert len(inside) == 2 and all(0 <= value <= 1 for value in inside)
+    assert {row.metric for row in rows} >= {"enough_in_bands", "band_radius", "num_unlike"}
+    written = tmp_path / "evaluation_test_unseen"
+    assert "10 scenes of more" in (written / "coverage.md").read_text() and (written / "coverage.png").exists()
+    shutil.rmtree(written)
+    rows = evaluate(tmp_path / "data", tmp_path, checkpoints, *more)
+    assert "these scenes are the calibration scenes" in caplog.text
+    assert not [row for row in rows if row.metric == "fraction_in_bands"]
+    alone = evaluate(tiny_data, tmp_path / "alone", run, "evaluation.num_pictures=0")
+    assert not [row for row in alone if row.metric == "fraction_in_bands"], "bands of an ensemble are not those of its member"
+
+
 def test_data_that_do_not_fit_are_refused_before_any_is_generated(checkpoint: Path, tmp_path: Path) -> None:
     with pytest.raises(
         SceneError, match=r"was trained with .* in 2D on sand; the scene has .* in 3D and sand; choose the data set with data="

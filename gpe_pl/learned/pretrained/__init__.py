@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
 
@@ -32,12 +33,16 @@ def fingerprint(checkpoint: Path | str) -> str:
     return f"{path.name} (sha256 {sha256(path.read_bytes()).hexdigest()[:12]})"
 
 
-def model_name(checkpoint: Path | str | None, runs: Path | str) -> str:
+def model_name(checkpoint: Path | str | Sequence[str] | None, runs: Path | str) -> str:
     """Return the name of a model for use in folder names: that of a shipped model, or the path of its run below ``runs`` with ``_`` for ``/``.
 
+    An ensemble has the name of its first member and the number of members.
     If the checkpoint is not the best one of its run, its file's name is appended. For a checkpoint outside a folder ``checkpoints/``, the result is the file's
     name. Characters that file names cannot have are encoded by ``names.portable``.
     """
+    if isinstance(checkpoint, Sequence) and not isinstance(checkpoint, str):
+        first = model_name(checkpoint[0] if checkpoint else None, runs)
+        return first if len(checkpoint) == 1 else f"{first}_ensemble_of_{len(checkpoint)}"
     if checkpoint is None or str(checkpoint) in names():
         return str(checkpoint)
     path = Path(checkpoint).resolve()

@@ -1,0 +1,77 @@
+"""Calibrates error bands on the scenes of an evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.errors import GpeError
+from gpe_pl.evaluation.metric_rows import LEARNED
+from gpe_pl.evaluation.predictions import PredictedScene
+from gpe_pl.learned.bands import LEVEL, Bands, factors_of, rounded_up, scores_of
+from gpe_pl.learned.pretrained import checkpoint_path
+from gpe_pl.learned.unlike import united
+from gpe_pl.learned.verdicts import checksum
+from gpe_pl.metrics.conformal import fewest_scenes
+
+
+class CalibrationError(GpeError, ValueError):
+    """Raised when scenes cannot calibrate bands; the message says what to do."""
+
+
+@dataclass
+class Calibration:
+    """Collects calibration scenes.
+
+    Attributes:
+        split_checksum: checksum of the calibration split.
+        containment: whether rollouts are contained in walls.
+        start_frame: frame of the scenes at which rollouts start.
+    """
+
+    split_checksum: str
+    containment: bool
+    start_frame: int
+    scenes: list[np.ndarray] = field(default_factory=list)
+    spreads: list[np.ndarray] = field(default_factory=list)
+    features: list[dict[str, tuple[float, float]]] = field(default_factory=list)
+    about: tuple[str, str, float] = ("", "", 0.0)
+
+    def add(self, scene: PredictedScene) -> None:
+        """Add a scene after its rollout."""
+        prediction, metadata = scene.predictions[LEARNED], scene.truth.metadata
+        self.about = metadata.dataset, metadata.split, metadata.frame_dt
+        self.scenes.append(scores_of(prediction, scene.truth, scene.spread))
+        self.features.append(scene.features)
+        if scene.spread is not None:
+            self.spreads.append(scene.spread.mean(axis=1))
+
+    def bands(self, checkpoints: Sequence[Path | str]) -> Bands:
+        """Return the bands of the checkpoints that rolled the scenes out.
+
+        Raises:
+            CalibrationError: there are too few scenes for ``LEVEL``.
+        """
+        if len(self.scenes) < (fewest := fewest_scenes(LEVEL)):
+            raise CalibrationError(
+                f"{len(self.scenes)} calibration scenes: bands with a level of {LEVEL:g} need at least {fewest}; choose more, such as data.num_test=40"
+            )
+        dataset, split, frame_dt = self.about
+        shortest = min(map(len, self.spreads), default=0)
+        return Bands(
+            checkpoints=[checksum(checkpoint_path(path)) for path in checkpoints],
+            dataset=dataset,
+            split=split,
+            split_checksum=self.split_checksum,
+            num_scenes=len(self.scenes),
+            start_frame=self.start_frame,
+            frame_dt=frame_dt,
+            containment=self.containment,
+            nodes=factors_of(self.scenes, "nodes"),
+            scene=factors_of(self.scenes, "scene"),
+            spread=[rounded_up(max(own[frame] for own in self.spreads)) for frame in range(1, shortest)],
+            features={name: (float(f"{low:.6g}"), float(f"{high:.6g}")) for name, (low, high) in united(self.features).items()},
+        )

@@ -1,0 +1,92 @@
+"""What an evaluation does about uncertainty: it calibrates error bands, or measures their coverage, and warns of scenes unlike the known ones."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from gpe_pl.evaluation.calibration import Calibration
+from gpe_pl.evaluation.coverage import TABLE, Coverage
+from gpe_pl.evaluation.horizons import labels
+from gpe_pl.evaluation.metric_rows import LEARNED, Row
+from gpe_pl.evaluation.predictions import PredictedScene
+from gpe_pl.evaluation.settings import EvaluationSettings
+from gpe_pl.learned import bands
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.unlike import UnlikeScenes, trained_limits
+from gpe_pl.schema import Split
+
+log = logging.getLogger(__name__)
+
+
+class Uncertainty:
+    """Sees the scenes of a split after their rollouts.
+
+    Args:
+        checkpoints: checkpoints of the evaluated model, or of the members of an ensemble.
+        first: the model, or the first member.
+        settings: settings of the evaluation.
+        split: evaluated split.
+        split_checksum: checksum of its scenes.
+        calibrate: calibrate bands instead of measuring the coverage of stored ones.
+
+    Raises:
+        SealError: the bands beside the checkpoint are damaged.
+    """
+
+    def __init__(
+        self,
+        checkpoints: Sequence[str],
+        first: LearnedSimulator,
+        settings: EvaluationSettings,
+        split: Split,
+        split_checksum: str,
+        calibrate: bool = False,
+    ) -> None:
+        self.checkpoints, self.split = checkpoints, split
+        frame_dt = first.builder.metadata.frame_dt
+        self.horizons = labels(settings.horizons, frame_dt)
+        start_frame = settings.first_frame(first.builder.config.history, frame_dt)
+        self.calibration = Calibration(split_checksum, settings.containment, start_frame) if calibrate else None
+        stored = None if calibrate else bands.read(*checkpoints)
+        unfit = "" if stored is None else stored.unfit(start_frame, settings.containment, split_checksum)
+        if unfit:
+            log.warning("the coverage of the model's error bands is not measured: %s", unfit)
+        self.coverage = None if stored is None or unfit else Coverage(stored)
+        if stored is None:
+            self.unlike = UnlikeScenes(trained_limits(first), "training")
+        else:
+            self.unlike = UnlikeScenes(stored.features, "calibration scenes", stored.spread)
+
+    def see(self, scene: PredictedScene, about: tuple[str, int, str, float]) -> Iterator[Row]:
+        """Take a scene, and yield further metrics (``Coverage.add``), and the number of quantities in which it is unlike the known scenes (``num_unlike``).
+
+        Args:
+            scene: scene with its rollouts.
+            about: split, number, parameter group and parameter of the scene, as in ``Row``.
+        """
+        if self.calibration is not None:
+            self.calibration.add(scene)
+            return
+        spread = None if scene.spread is None else scene.spread.mean(axis=1)
+        num_unlike = self.unlike.add(scene.features, spread)
+        if self.coverage is not None:
+            yield Row(LEARNED, *about, "num_unlike", "full", float(num_unlike))
+            yield from self.coverage.add(scene, self.horizons, about)
+
+    def finish(self, folder: Path) -> None:
+        """Store the bands beside the checkpoint, or write the table and the figure of coverage into the folder of the evaluation. Log warnings.
+
+        Raises:
+            CalibrationError: there are too few scenes.
+        """
+        if self.calibration is not None:
+            path = bands.path_beside(self.checkpoints)
+            bands.write(path, self.calibration.bands(self.checkpoints))
+            print(path)
+            return
+        self.unlike.warn(self.split)
+        if self.coverage is not None:
+            self.coverage.write(folder, self.horizons)
+            print((folder / TABLE).read_text())

@@ -1,0 +1,92 @@
+"""Rollouts with error bands, and with warnings if a scene is unlike those that the model knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from gpe_pl.learned.bands import LEVEL, Bands, Guarantee
+from gpe_pl.learned.ensemble import LearnedEnsemble, combined, members_of
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.unlike import UnlikeScenes, Watch, trained_limits
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.ensemble import spread
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import Simulator, rollout
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+
+
+@dataclass(frozen=True)
+class BandedRollout:
+    """A rollout with the radii of its error bands.
+
+    Attributes:
+        trajectory: predicted frames.
+        radius: radii of the bands around the predicted positions [frame, node] in m; None without bands.
+        spread: spread of an ensemble's members [frame, node] in m; None for a single model.
+        unlike: what is unlike the known scenes, one line per quantity.
+    """
+
+    trajectory: Trajectory
+    radius: Float[np.ndarray, "frame node"] | None
+    spread: Float[np.ndarray, "frame node"] | None
+    unlike: list[str]
+
+
+def roll_out_with_bands(
+    simulator: LearnedSimulator | LearnedEnsemble,
+    state: State,
+    num_steps: int,
+    metadata: Metadata,
+    bands: Bands | None,
+    level: float = LEVEL,
+    guarantee: Guarantee = "nodes",
+    guard: Guard | None = None,
+) -> BandedRollout:
+    """Roll a model or an ensemble forward, with error bands, and warn if the scene is unlike those of the calibration.
+
+    Bands promise coverage for rollouts as in calibration: contained in walls if these were, and from the frame ``bands.start_frame`` of a scene on.
+
+    Args:
+        simulator: trained model, or an ensemble.
+        state: initial state from ``initial_state`` or ``standing``, which becomes frame 0.
+        num_steps: number of frames to add.
+        metadata: metadata of the scene.
+        bands: bands of the model, as ``bands.read`` returns them; without, the scene is compared with the statistics of the training.
+        level: nominal coverage, one of ``bands.LEVELS``.
+        guarantee: what the bands promise (see ``bands``).
+        guard: stops the rollout at the first state that it rejects.
+
+    Raises:
+        ValueError: bands of this level are not stored, or are of another number of members.
+    """
+    members = members_of(simulator)
+    if bands is not None and len(bands.checkpoints) != len(members):
+        raise ValueError(
+            f"the bands are of {len(bands.checkpoints)} checkpoints, the simulator has {len(members)}; read those of the same checkpoints"
+        )
+    dt, spreads = members[0].builder.metadata.frame_dt, [np.zeros(state.num_nodes)]
+    watch = Watch(members[0], num_steps)
+    watch.see(0, state)
+
+    def wrapped(member: LearnedSimulator) -> Simulator:
+        return Contained(member, dt) if bands is None or bands.containment else member
+
+    def see(frame: int, new: State) -> None:
+        watch.see(frame, new)
+        if len(members) > 1:
+            spreads.append(np.asarray(spread(new)))
+
+    trajectory = rollout(combined(members, wrapped), state, num_steps, metadata, guard, see)
+    own_spread = np.stack(spreads) if len(members) > 1 else None
+    if bands is None:
+        unlike = UnlikeScenes(trained_limits(members[0]), "training")
+    else:
+        unlike = UnlikeScenes(bands.features, "calibration scenes", bands.spread)
+    unlike.add(watch.found, None if own_spread is None else own_spread.mean(axis=1))
+    unlike.warn("this rollout")
+    radius = None if bands is None else bands.radius(trajectory, own_spread, level, guarantee)
+    return BandedRollout(trajectory, radius, own_spread, [line for line, _ in unlike.lines.values()])

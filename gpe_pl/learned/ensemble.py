@@ -1,0 +1,78 @@
+"""Several trained models as one simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gpe_pl.learned.checkpoint_file import CheckpointError
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.rollout.ensemble import Ensemble
+from gpe_pl.rollout.loop import Simulator
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+
+
+@dataclass(frozen=True)
+class LearnedEnsemble(Ensemble):
+    """Trained models whose mean is the prediction, for example one network trained with several seeds.
+
+    Use it like a ``LearnedSimulator``: take a state from ``initial_state`` or ``standing``, and roll it out. ``rollout.ensemble.spread`` returns how far the
+    members are from each other.
+
+    Attributes:
+        members: models with the same frame interval, spacing, materials and history.
+    """
+
+    members: tuple[LearnedSimulator, ...]
+
+    @classmethod
+    def from_checkpoints(cls, checkpoints: Sequence[Path | str], device: Any = "cpu") -> LearnedEnsemble:
+        """Return the ensemble of several checkpoints.
+
+        Args:
+            checkpoints: paths, folders of runs, or names of shipped models, as in ``LearnedSimulator.from_checkpoint``.
+            device: device of the simulators.
+
+        Raises:
+            CheckpointError: a checkpoint cannot be loaded, or does not fit the first one.
+        """
+        if not checkpoints:
+            raise CheckpointError("an ensemble needs at least one checkpoint; name some")
+        members = tuple(LearnedSimulator.from_checkpoint(path, device) for path in checkpoints)
+        first = members[0]
+        for path, other in zip(checkpoints[1:], members[1:], strict=True):
+            own, there = first.builder, other.builder
+            if not (first.fits(there.metadata) and other.fits(own.metadata)) or own.config.history != there.config.history:
+                raise CheckpointError(
+                    f"{path}: has other materials, frames, spacing or history than {checkpoints[0]}; members of an ensemble share them"
+                )
+        return cls(members)
+
+    def initial_state(self, trajectory: Trajectory, frame: int) -> State:
+        """Do the same as ``LearnedSimulator.initial_state``."""
+        return self.members[0].initial_state(trajectory, frame)
+
+    def standing(self, state: State, scene: Metadata) -> State:
+        """Do the same as ``LearnedSimulator.standing``."""
+        return self.members[0].standing(state, scene)
+
+
+def members_of(simulator: LearnedSimulator | LearnedEnsemble) -> tuple[LearnedSimulator, ...]:
+    """Return the models of an ensemble, or the model itself."""
+    return simulator.members if isinstance(simulator, LearnedEnsemble) else (simulator,)
+
+
+def combined(members: Sequence[LearnedSimulator], wrapped: Callable[[LearnedSimulator], Simulator]) -> Simulator:
+    """Return models as one simulator after each was wrapped, for example with containment. A single model stays what it is."""
+    parts = tuple(wrapped(member) for member in members)
+    return parts[0] if len(parts) == 1 else Ensemble(parts)
+
+
+def configured(simulator: LearnedSimulator | LearnedEnsemble, **settings: Any) -> LearnedSimulator | LearnedEnsemble:
+    """Return a copy with other settings of ``LearnedSimulator.configured``, for all members of an ensemble."""
+    if isinstance(simulator, LearnedEnsemble):
+        return LearnedEnsemble(tuple(member.configured(**settings) for member in simulator.members))
+    return simulator.configured(**settings)

@@ -1,0 +1,153 @@
+"""Error bands beside a checkpoint: what they promise, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpe_pl.evaluation.calibration import Calibration, CalibrationError
+from gpe_pl.evaluation.coverage import Coverage
+from gpe_pl.evaluation.metric_rows import LEARNED, Row
+from gpe_pl.evaluation.predictions import PredictedScene
+from gpe_pl.files.sealed import SealError
+from gpe_pl.learned import bands
+from gpe_pl.learned.banded import roll_out_with_bands
+from gpe_pl.learned.bands import Bands
+from gpe_pl.learned.ensemble import LearnedEnsemble
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.rollout.loop import rollout
+from gpe_pl.trajectory.trajectory import Termination, Trajectory
+from tests.conftest import make_trajectory
+from tests.scenes import metadata, state
+
+FRAMES, NODES = 5, 8
+Found = dict[str, dict[str, tuple[float, float]]]
+
+
+def scene(seed: int, num_frames: int = FRAMES, **about: Any) -> PredictedScene:
+    """Return a scene whose prediction is wrong by an amount that all its nodes share, and that grows with their motion."""
+    rng = np.random.default_rng(seed)
+    truth = make_trajectory(seed, num_frames, NODES, **about)
+    steps = np.abs(rng.normal(size=(num_frames, NODES, 2))) * 0.01
+    pos = 0.3 + np.cumsum(steps, axis=0)
+    prediction = replace(truth, pos=pos)
+    scale = bands.scale_of(prediction, None)
+    wrong = scale * np.abs(rng.standard_t(3)) * rng.random((num_frames, NODES))
+    truth = replace(truth, pos=pos + np.stack([wrong, 0 * wrong], axis=-1))
+    return PredictedScene(truth, truth, {LEARNED: prediction}, {}, {}, [], None, {"speed": (0.0, float(seed))})
+
+
+def calibrated(num_scenes: int, checkpoint: Path, first: int = 0) -> Bands:
+    calibration = Calibration("abc", True, 2)
+    for seed in range(first, first + num_scenes):
+        calibration.add(scene(seed))
+    return calibration.bands([checkpoint])
+
+
+def covered(own: Bands, scenes: list[PredictedScene]) -> list[Row]:
+    coverage = Coverage(own)
+    return [row for number, each in enumerate(scenes) for row in coverage.add(each, {2: "0.02s"}, ("test", number, "seen", 0.0))]
+
+
+def test_new_scenes_are_covered_as_promised(checkpoint: Path) -> None:
+    """Over many calibrations, so that chance does not decide."""
+    values: dict[str, list[float]] = {}
+    for k in range(12):
+        own = calibrated(19, checkpoint, 1000 * k)
+        for row in covered(own, [scene(seed) for seed in range(1000 * k + 100, 1000 * k + 110)]):
+            values.setdefault(row.metric, []).append(row.value)
+    assert 0.87 < np.mean(values["fraction_in_bands"]) < 0.97
+    assert 0.84 < np.mean(values["enough_in_bands"]) < 0.98
+    assert set(values["enough_in_bands"]) == {0.0, 1.0}
+
+
+def test_bands_for_scenes_are_wider(checkpoint: Path) -> None:
+    own = calibrated(30, checkpoint)
+    prediction = scene(99).predictions[LEARNED]
+    nodes, whole = own.radius(prediction), own.radius(prediction, guarantee="scene")
+    assert (nodes[0] == 0).all() and (whole[1:].mean() > nodes[1:].mean())
+    assert (own.radius(prediction, level=0.95)[1:] >= nodes[1:]).all()
+    longer = scene(98, FRAMES + 2).predictions[LEARNED]
+    assert np.isinf(own.radius(longer)[FRAMES:]).all() and np.isfinite(own.radius(longer)[:FRAMES]).all()
+    with pytest.raises(ValueError, match=r"level=0.99: bands are stored for 0.5, 0.6"):
+        own.radius(prediction, level=0.99)
+    with pytest.raises(ValueError, match="go without"):
+        own.radius(prediction, np.zeros((FRAMES, NODES)))
+
+
+def test_a_stopped_rollout_makes_bands_infinite(checkpoint: Path) -> None:
+    calibration = Calibration("abc", True, 2)
+    for seed in range(9):
+        each = scene(seed)
+        if seed == 4:
+            cut = replace(each.predictions[LEARNED].frames(0, 3), termination=Termination("nan", 3, 0, "frame 3"))
+            each = replace(each, predictions={LEARNED: cut})
+        calibration.add(each)
+    own = calibration.bands([checkpoint])
+    factors = own.factors(0.9)
+    assert np.isfinite(factors[:3]).all() and np.isinf(factors[3:]).all()
+    assert np.isfinite(own.factors(0.5)).all()
+    assert covered(own, [scene(50)])
+
+
+def test_too_few_scenes_are_refused(checkpoint: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"8 calibration scenes: bands with a level of 0.9 need at least 9"):
+        calibrated(8, checkpoint)
+
+
+def test_bands_survive_the_file(checkpoint: Path, tmp_path: Path) -> None:
+    own = tmp_path / "best.ckpt"
+    own.write_bytes(checkpoint.read_bytes())
+    assert bands.read(own) is None
+    stored = calibrated(19, own)
+    path = bands.path_beside([own])
+    bands.write(path, stored)
+    assert path.name == "best.bands.json" and bands.read(own) == stored
+    assert stored.features == {"speed": (0.0, 18.0)}
+    assert bands.path_beside([own, own]).name == "best.ensemble_of_2.bands.json"
+    values = json.loads(path.read_text())
+    values["nodes"]["0.9"][0] = 0.0
+    path.write_text(json.dumps(values))
+    with pytest.raises(SealError, match="calibrate again"):
+        bands.read(own)
+    bands.write(path, stored)
+    LearnedSimulator.from_checkpoint(checkpoint).save(own)
+    with open(own, "ab") as file:
+        file.write(b" ")
+    assert bands.read(own) is None, "bands of another checkpoint"
+
+
+def test_bands_name_what_they_do_not_hold_for(checkpoint: Path) -> None:
+    own = calibrated(19, checkpoint)
+    assert own.unfit(2, True, "other") == ""
+    assert "calibration scenes" in own.unfit(2, True, "abc")
+    assert "frame 3" in own.unfit(3, True, "other") and "containment=false" in own.unfit(2, False, "other")
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-9, 1.0, 3.14159, 99995.0, 123456.0])
+def test_stored_factors_are_not_smaller(value: float) -> None:
+    assert value <= bands.rounded_up(value) <= value * 1.0011
+
+
+def test_an_ensemble_of_equal_members_is_its_member(checkpoint: Path) -> None:
+    single = LearnedSimulator.from_checkpoint(checkpoint)
+    ensemble = LearnedEnsemble.from_checkpoints([checkpoint, checkpoint])
+    start = single.standing(state().to_torch(), metadata())
+    alone = roll_out_with_bands(single, start, 3, metadata(), None)
+    both = roll_out_with_bands(ensemble, start, 3, metadata(), None)
+    np.testing.assert_allclose(both.trajectory.pos, alone.trajectory.pos, atol=1e-9)
+    assert alone.spread is None and both.spread is not None and both.spread.shape == both.trajectory.pos.shape[:2]
+    assert float(both.spread.max()) < 1e-9
+    own = calibrated(19, checkpoint)
+    banded = roll_out_with_bands(single, start, 3, metadata(), own)
+    assert banded.radius is not None and banded.radius.shape == alone.trajectory.pos.shape[:2] and (banded.radius[1:] > 0).all()
+    assert math.isfinite(float(banded.radius.max()))
+    with pytest.raises(ValueError, match="bands are of 1 checkpoints, the simulator has 2"):
+        roll_out_with_bands(ensemble, start, 3, metadata(), own)
+    assert isinstance(rollout(ensemble, start, 2, metadata()), Trajectory)

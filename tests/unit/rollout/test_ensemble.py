@@ -1,0 +1,70 @@
+"""An ensemble predicts the mean of its members' own rollouts, and knows how far they are apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from gpe_pl.rollout.ensemble import Ensemble, mean_state, spread
+from gpe_pl.rollout.loop import SimulationError, Simulator, Start, rollout, rollouts, steps
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Growing:
+    """Multiplies velocities by a factor, so that members differ more and more; fails in a frame."""
+
+    factor: float
+    fails_at: float = np.inf
+
+    def step(self, state: State) -> State:
+        if state.time > self.fails_at:
+            raise SimulationError("gave up", reason="test", node=3)
+        vel = self.factor * state.vel
+        return state.later(0.01, state.pos + 0.01 * vel, vel)
+
+
+def test_members_follow_their_own_trajectories(trajectory: Trajectory) -> None:
+    start, members = trajectory.state(0), (Growing(0.5), Growing(1.5))
+    mean = rollout(Ensemble(members), start, 4, trajectory.metadata)
+    own = [rollout(member, start, 4, trajectory.metadata) for member in members]
+    np.testing.assert_allclose(mean.pos, (own[0].pos + own[1].pos) / 2, atol=1e-12)
+    averaged = rollout(Growing(1.0), start, 4, trajectory.metadata)  # what a mean of both in every step would give
+    assert np.abs(mean.pos - averaged.pos)[2:].max() > 1e-3
+
+
+def test_spread_is_the_distance_from_the_mean(trajectory: Trajectory) -> None:
+    start, simulators = trajectory.state(0), [Growing(0.5), Growing(1.5), Growing(1.0)]
+    assert spread(start) is None
+    mean = list(steps(Ensemble(tuple(simulators)), start, 3))[-1]
+    own = np.stack([list(steps(simulator, start, 3))[-1].pos for simulator in simulators])
+    expected = np.sqrt(((own - own.mean(axis=0)) ** 2).sum(axis=-1).sum(axis=0) / 2)
+    np.testing.assert_allclose(np.asarray(spread(mean)), expected, rtol=1e-9)
+    same = list(steps(Ensemble((Growing(1.1), Growing(1.1))), start, 3))[-1]
+    assert np.asarray(spread(same)).max() < 1e-12
+
+
+def test_scenes_are_advanced_together_and_fail_alone(trajectory: Trajectory) -> None:
+    ensemble: Simulator = Ensemble((Growing(0.5), Growing(1.5, fails_at=0.015)))
+    late = replace(trajectory.state(0), time=-1.0)
+    stopped, whole = rollouts(ensemble, [Start(s, 4, trajectory.metadata) for s in (trajectory.state(0), late)])
+    assert stopped.termination is not None and stopped.termination.frame == 3 and stopped.termination.node == 3
+    assert "member 2 of 2: gave up" in stopped.termination.message
+    assert whole.termination is None and whole.num_frames == 5
+
+
+def test_means_are_taken_across_a_periodic_seam(new_trajectory: object) -> None:
+    trajectory = new_trajectory(periodic=(True, False), connectivity_radius=0.15)  # type: ignore[operator]
+    state = trajectory.state(0)
+    pos = np.tile([[0.98, 0.5]], (state.num_nodes, 1))
+    left = replace(state, pos=pos)
+    right = replace(state, pos=np.full_like(pos, 0.5) - np.array([0.46, 0.0]))
+    np.testing.assert_allclose(mean_state([left, right]).pos[0], [0.01, 0.5], atol=1e-12)
+
+
+def test_a_member_that_fails_in_a_single_step_raises(trajectory: Trajectory) -> None:
+    with pytest.raises(SimulationError, match="member 1 of 2"):
+        Ensemble((Growing(1.0, fails_at=-1.0), Growing(1.0))).step(trajectory.state(0))
