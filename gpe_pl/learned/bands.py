@@ -130,10 +130,11 @@ class Bands:
 def scale_of(prediction: Trajectory, spread: Float[np.ndarray, "frame node"] | None) -> Float[np.ndarray, "frame node"]:
     """Return how uncertain the predicted positions of nodes are relative to each other in a frame [m].
 
-    It is one spacing for a single model, so that all nodes have the same band in a frame. For an ensemble, it is the spread plus ``FLOOR_SPACINGS`` spacings.
+    It is one spacing for a single model, so that all nodes have the same band in a frame. For an ensemble, it is
+    √(spread · spacing) plus ``FLOOR_SPACINGS`` spacings: errors grow more slowly than the spread.
     """
     spacing = prediction.metadata.spacing
-    return np.full(prediction.pos.shape[:2], spacing) if spread is None else spread + FLOOR_SPACINGS * spacing
+    return np.full(prediction.pos.shape[:2], spacing) if spread is None else np.sqrt(spread * spacing) + FLOOR_SPACINGS * spacing
 
 
 def errors_of(prediction: Trajectory, truth: Trajectory) -> Float[np.ndarray, "frame node"]:
