@@ -105,9 +105,6 @@ def evaluate(
         rows.append(Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split, stride=stride)))
         curves: dict[str, list[np.ndarray]] = {}
         for number, scene in enumerate(predictor.scenes(root, split)):
-            stop = scene.predictions[label].termination
-            if stop is not None:
-                log.warning("%s %d stopped: %s, %s", split, number, stop.reason, stop.message)
             about = (split, number, scene.truth.metadata.parameter_group, _parameter(scene.trajectory))
             rows += _rows(scene, about, label, labels(settings.horizons, frame_dt))
             rows += see(scene, about) if see else []
@@ -134,7 +131,10 @@ def _draw(run_dir: Path, scene: PredictedScene, split: str, number: int, label: 
 
 
 def _rows(scene: PredictedScene, about: About, label: str, horizons: dict[int, str]) -> Iterator[Row]:
-    """Yield the metrics of a scene. ``horizons`` has labels by the number of frames."""
+    """Yield the metrics of a scene, and warn if its rollout stopped. ``horizons`` has labels by the number of frames."""
+    stop = scene.predictions[label].termination
+    if stop is not None:
+        log.warning("%s %d stopped: %s, %s", *about[:2], stop.reason, stop.message)
     compared = {model: (prediction, scene.truth) for model, prediction in scene.predictions.items()} | scene.solver_runs
     for model, (prediction, reference) in compared.items():
         for record in rollout_metrics(prediction, reference, [*horizons, "full"]):

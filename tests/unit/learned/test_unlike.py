@@ -65,8 +65,13 @@ def test_statistics_of_training_are_limits_without_calibration(simulator: Learne
 def test_few_frames_are_looked_at(simulator: LearnedSimulator, monkeypatch: pytest.MonkeyPatch) -> None:
     assert sampled_frames(101) == {0, 25, 50, 75, 100} and sampled_frames(2) == {0, 1}
     own = simulator.standing(state(), metadata())
-    watch, calls = Watch(simulator, 100), []
-    monkeypatch.setattr("gpe_pl.learned.unlike.quantities", lambda *_: calls.append(1) or {"speed": (0.0, float(len(calls)))})
+    watch, calls = Watch(simulator, 100), list[State]()
+
+    def counted(_: object, seen: State) -> dict[str, tuple[float, float]]:
+        calls.append(seen)
+        return {"speed": (0.0, float(len(calls)))}
+
+    monkeypatch.setattr("gpe_pl.learned.unlike.quantities", counted)
     for frame in range(101):
         watch.see(frame, own)
     assert len(calls) == 5 and watch.found == {"speed": (0.0, 5.0)}
