@@ -17,6 +17,7 @@ from torch import Tensor
 from torch_geometric.data import HeteroData
 
 from gpe_pl.graphs.compiled_graph import works_on
+from gpe_pl.graphs.topology import Topology
 from gpe_pl.nn.stores import contents
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import mean_over_corners
@@ -53,6 +54,22 @@ def moved(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor
             values["velocity_history"] = torch.from_numpy(np.concatenate([past[:, 1:], vel[:, None]], axis=1))
         new.append(state.later(dt, torch.from_numpy(pos), torch.from_numpy(vel), **values))
     return new
+
+
+def keep_slow(state: State, new: State, topology: Topology, duration: float) -> None:
+    """Put nodes that static friction keeps in place back to their old positions, with zero velocity, in the arrays of a new state (see ``nn.static_friction``).
+
+    Args:
+        state: state before the step, whose walls are at rest.
+        new: state that ``moved`` and ``with_frame_velocity`` returned. Its arrays are changed.
+        topology: topology of ``state``.
+        duration: time in which gravity gives the speed below which a node keeps its position [s].
+    """
+    assert topology.islands is not None
+    history = new.vel[:, None] if new.velocity_history is None else new.velocity_history
+    at_frame = new.vel if new.frame_velocity is None else new.frame_velocity
+    before = (state.pos.numpy(), state.vel.numpy(), topology.islands.label.numpy(), topology.islands.is_free.numpy())
+    _keep_slow(*before, state.gravity.numpy(), duration, new.pos.numpy(), new.vel.numpy(), history.numpy(), at_frame.numpy())
 
 
 def accelerations(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor], unit: Tensor) -> list[Tensor]:
@@ -118,6 +135,24 @@ def per_scene(predicted: dict[str, Tensor], rows: Sequence[Rows]) -> Iterator[tu
             continue
         for scene, part in enumerate(values.split([r.shape[0] for r in own])):
             yield scene, own[scene], part
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _keep_slow(old_pos, old_vel, island, is_free, gravity, duration, pos, vel, history, at_frame):
+    speed = duration * np.sqrt((gravity * gravity).sum())
+    for n in range(pos.shape[0]):
+        before, after = 0.0, 0.0
+        for a in range(pos.shape[1]):
+            before += old_vel[n, a] ** 2
+            after += vel[n, a] ** 2
+        if is_free[island[n]] or not (before < speed**2 and after < speed**2):
+            continue
+        for a in range(pos.shape[1]):
+            pos[n, a] = old_pos[n, a]
+            vel[n, a] = 0.0
+            history[n, history.shape[1] - 1, a] = 0.0
+            at_frame[n, a] = 0.0
 
 
 @njit(cache=True, error_model="numpy")

@@ -414,7 +414,7 @@ class LearnedSimulator(nn.Module):
 
     def _advance_all(self, states: list[State], topologies: list[Topology], standards: Standards | None) -> list[State]:
         builder, rows, graphs = self.builder, [t.rows for t in topologies], list[HeteroData]()
-        if self.static_friction or len(states) == 1:
+        if len(states) == 1 or (self.static_friction and standards is None):
             graphs = [builder.graph(topology, state, standards) for topology, state in zip(topologies, states, strict=True)]
             data = graphs[0] if len(graphs) == 1 else batched(graphs)
         else:
@@ -423,8 +423,11 @@ class LearnedSimulator(nn.Module):
         data = data.to(self.acceleration_std.device) if self.acceleration_std.device != states[0].pos.device else data
         predicted = (self.model(data) if standards is not None else self(data)).to(states[0].pos.device)
         new = self.later(states, rows, predicted)
-        if self.static_friction:
-            new = [self._with_static_friction(*parts, standards is not None) for parts in zip(states, new, graphs, strict=True)]
+        if self.static_friction and standards is None:
+            new = [self._with_static_friction(*parts) for parts in zip(states, new, graphs, strict=True)]
+        elif self.static_friction:  # walls are at rest
+            for state, after, topology in zip(states, new, topologies, strict=True):
+                next_states.keep_slow(state, after, topology, self.static_friction * builder.metadata.frame_dt)
         if not predicted.stress:
             return new
         components = next(iter(builder.spec.stress_channels.values()))
@@ -438,7 +441,7 @@ class LearnedSimulator(nn.Module):
     def later(self, states: list[State], rows: Sequence[Rows], predicted: Prediction) -> list[State]:
         """Do the same as ``moved`` without static friction, given the rows of the nodes of each material in each state."""
         acceleration, dt = predicted.acceleration, self.builder.metadata.frame_dt
-        if not self.static_friction and next_states.works_on_all(states, acceleration):
+        if next_states.works_on_all(states, acceleration):
             new = next_states.moved(states, rows, acceleration, float(self.acceleration_std), dt)
         else:
             all_acc = next_states.accelerations(states, rows, acceleration, self.acceleration_std)
@@ -450,12 +453,12 @@ class LearnedSimulator(nn.Module):
         new = self.advance(state, acc)
         return self._with_static_friction(state, new, graph) if self.static_friction else new
 
-    def _with_static_friction(self, state: State, new: State, graph: HeteroData, walls_rest: bool = False) -> State:
+    def _with_static_friction(self, state: State, new: State, graph: HeteroData) -> State:
         """Return the new state, in which nodes that static friction keeps in place have their old positions and zero velocity."""
         island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
-        stays = keeps_position(state.vel, new.vel, island, self.supported(graph, walls_rest), self.slowest(state.gravity))[:, None]
+        stays = keeps_position(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))[:, None]
         new = new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))
         return new if new.frame_velocity is None else replace(new, frame_velocity=torch.where(stays, 0.0, new.frame_velocity))
 
@@ -463,11 +466,11 @@ class LearnedSimulator(nn.Module):
         """Return the speed [m/s] below which static friction keeps nodes in place."""
         return self.static_friction * self.builder.metadata.frame_dt * gravity.norm()
 
-    def supported(self, graph: HeteroData, walls_rest: bool = False) -> Tensor:
-        """Return a mask [island] of the islands that static friction may keep in place. Without ``walls_rest``, features must not be standardised."""
+    def supported(self, graph: HeteroData) -> Tensor:
+        """Return a mask [island] of the islands that static friction may keep in place. Features must not be standardised."""
         spec = self.builder.spec
         vel = graph[BOUNDARY].x[:, : spec.dim]
-        moves = torch.zeros(len(vel), dtype=torch.bool, device=vel.device) if walls_rest else (vel != 0).any(dim=1)
+        moves = (vel != 0).any(dim=1)
         walls = [relation for relation in spec.relations if relation[0] == BOUNDARY]
         edges = [(graph[relation].edge_index, graph[relation[2]].island) for relation in walls]
         return supported(graph.island_is_free, [(island[i], moves[j]) for (j, i), island in edges])

@@ -94,6 +94,26 @@ def test_features_are_compiled_unless_a_wall_moves(monkeypatch: pytest.MonkeyPat
         assert torch.equal(learned.step(state.to_torch()).pos, still.pos)
 
 
+@pytest.mark.parametrize("materials", [("sand",), ("snow", "sand")])
+def test_compiled_steps_of_several_scenes_keep_the_same_nodes(materials: tuple[str, ...]) -> None:
+    first, lies = lying_and_flying(materials)
+    vel = np.where(np.arange(24)[:, None] % 3 == 0, [0.1, 0.0], 0.0)  # a third is too fast
+    second = replace(first, vel=vel, velocity_history=vel[:, None], frame_velocity=vel.copy())
+    states = [first.to_torch(), second.to_torch()]
+    learned = simulator(materials=materials)
+    learned.static_friction = ENOUGH
+    found = learned.step_all(states)
+    with unfused():
+        expected = learned.step_all(states)
+    for new, other, old in zip(found, expected, states, strict=True):
+        assert isinstance(new, State) and isinstance(other, State)
+        for name in ("pos", "vel", "velocity_history"):
+            torch.testing.assert_close(getattr(new, name), getattr(other, name), rtol=0, atol=1e-14)
+        stays = (new.pos == old.pos).all(dim=1).numpy()
+        assert stays[lies].any() and not stays[~lies].any()
+    assert (found[0].pos[lies] == states[0].pos[lies]).all() and (found[1].pos[lies] != states[1].pos[lies]).any()  # type: ignore[union-attr]
+
+
 def test_at_rest_is_for_ever() -> None:
     state, lies = lying_and_flying()
     learned = simulator()
