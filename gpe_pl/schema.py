@@ -200,6 +200,7 @@ Values = Literal[
     "node types",  # of the data set's materials
     "parameters",  # finite if the node's material has the parameter, and positive if its scale is logarithmic
     "nodes of cells",  # rows of nodes; the number of different nodes is that of a kind of cell
+    "numbers of bodies",  # −1 for none
     "dimension of cells",  # 2 or 3, and at most the dimension of space
 ]
 """Rules for the values of stored arrays. ``gpe_pl.trajectory.values`` checks them."""
@@ -256,6 +257,14 @@ FIELDS: dict[str, Field] = {
         ("boundary_node",), "float32", "1", "fraction of the normal velocity that a bounce returns", values="0 to 1"
     ),
     "rest_pos": Field(("node", "dim"), "float32", "m", "undeformed positions of mesh nodes", required=False),
+    "rigid_body": Field(
+        ("node",),
+        "int32",
+        "1",
+        "number of the rigid body that a node belongs to, -1 for none; the nodes of a body move by one rigid motion",
+        required=False,
+        values="numbers of bodies",
+    ),
     "cells": Field(
         ("cell", "corner"),
         "int32",

@@ -197,12 +197,12 @@ def mgn_h5(path: Path, trajectories: Sequence[Mapping[str, np.ndarray]]) -> None
                 file.create_dataset(f"trajectory_{k}/{name}", data=array)
 
 
-def dpinet(folder: Path, pos: np.ndarray, vel: np.ndarray, **extra: np.ndarray) -> None:
+def dpinet(folder: Path, pos: np.ndarray, vel: np.ndarray | None, **extra: np.ndarray) -> None:
     """Write one rollout, a file per frame."""
     folder.mkdir(parents=True)
-    for k, (x, v) in enumerate(zip(pos, vel, strict=True)):
+    for k, x in enumerate(pos):
         with h5py.File(folder / f"{k}.h5", "w") as file:
-            for name, array in {"positions": x, "velocities": v, **extra}.items():
+            for name, array in {"positions": x, **({} if vel is None else {"velocities": vel[k]}), **extra}.items():
                 file[name] = array
 
 

@@ -413,6 +413,7 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             periodicity=trajectory.metadata.periodicity,
             param_names=trajectory.metadata.param_names,
             frame_velocity=at_frame,
+            rigid_body=trajectory.rigid_body,
         ).to_torch()
         stress = None
         if self.stress and trajectory.stress is not None:

@@ -26,6 +26,9 @@ SUBSTANTIAL = 0.1
 """A shared acceleration must differ from gravity by at least this fraction of gravity, and of the rms acceleration of all nodes. Smaller differences are
 disturbances of single groups."""
 
+AT_REST = 1e-3
+"""A group that moves by less than this fraction of the radius in a frame may lie on something that the data do not contain. It does not count as free."""
+
 MOST_FRAMES = 50
 """Maximum number of frames of a trajectory, evenly spread, in which groups are examined."""
 
@@ -128,6 +131,8 @@ def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames:
         if metadata.periodicity:  # relative to the middle frame, so that crossing the seam is not a jump
             window = metadata.periodicity.shortest(window - pos[frame])
         of_nodes = np.diff(window, 2, axis=0)[0] / dt**2
+        moves = np.linalg.norm(islands.mean(window[2] - window[1], mass), axis=-1) > AT_REST * radius
+        free &= moves
         acceleration = islands.mean(of_nodes, mass)[free]
         uncertain = resolution / np.sqrt(_independent(islands.label, pos[frame], count)[free])
         rms = float(np.sqrt(np.mean(np.sum(of_nodes**2, axis=-1))))

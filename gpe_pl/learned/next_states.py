@@ -21,6 +21,7 @@ from gpe_pl.graphs.topology import Topology
 from gpe_pl.nn.stores import contents
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import mean_over_corners
+from gpe_pl.trajectory.rigid_bodies import moved_rigidly
 from gpe_pl.trajectory.state import State, Stress
 
 Rows = Mapping[str, Tensor]
@@ -52,7 +53,8 @@ def moved(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor
         if state.velocity_history is not None:
             past = state.velocity_history.numpy()
             values["velocity_history"] = torch.from_numpy(np.concatenate([past[:, 1:], vel[:, None]], axis=1))
-        new.append(state.later(dt, torch.from_numpy(pos), torch.from_numpy(vel), **values))
+        after = state.later(dt, torch.from_numpy(pos), torch.from_numpy(vel), **values)
+        new.append(moved_rigidly(state, after, dt))
     return new
 
 
@@ -70,6 +72,11 @@ def keep_slow(state: State, new: State, topology: Topology, duration: float) -> 
     at_frame = new.vel if new.frame_velocity is None else new.frame_velocity
     before = (state.pos.numpy(), state.vel.numpy(), topology.islands.label.numpy(), topology.islands.is_free.numpy())
     _keep_slow(*before, state.gravity.numpy(), duration, new.pos.numpy(), new.vel.numpy(), history.numpy(), at_frame.numpy())
+
+
+def advanced(state: State, acc: Tensor, dt: float) -> State:
+    """Return the state one frame later under an acceleration [node, dim] in m/s² that includes gravity; ``dt`` is the frame interval [s]."""
+    return moved_rigidly(state, state.later(dt, *integrators.advance(state.pos, state.vel, acc, dt)), dt)
 
 
 def accelerations(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor], unit: Tensor) -> list[Tensor]:

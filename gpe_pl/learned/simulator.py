@@ -44,7 +44,7 @@ from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, EdgeType, node_code, param_names
 from gpe_pl.system.signatures import check_plain, checked
-from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.rigid_bodies import all_of_bodies
 from gpe_pl.trajectory.scene_ranges import described, outside, scene_range, united, unlimited
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
@@ -399,8 +399,8 @@ class LearnedSimulator(nn.Module):
         mass = self.standardizer.mass
         if mass.is_cuda or mass.dtype != self.builder.precision or not all(map(works_on, states)):
             return None
-        if self.static_friction and any(bool(state.boundary.vel.any()) for state in states):
-            return None  # static friction reads from the graph which walls move
+        if self.static_friction and any(bool(state.boundary.vel.any()) or state.rigid_body is not None for state in states):
+            return None  # static friction reads from the graph which walls move, and keeps rigid bodies as a whole
         return self.standardizer.standards(dict(self.trained_ranges()) if self.clamps_parameters else None)
 
     def _warn_of_unknown(self, graph: HeteroData) -> None:
@@ -458,7 +458,8 @@ class LearnedSimulator(nn.Module):
         island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
-        stays = keeps_position(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))[:, None]
+        stays = keeps_position(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))
+        stays = all_of_bodies(stays, state.rigid_body)[:, None]
         new = new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))
         return new if new.frame_velocity is None else replace(new, frame_velocity=torch.where(stays, 0.0, new.frame_velocity))
 
@@ -476,9 +477,8 @@ class LearnedSimulator(nn.Module):
         return supported(graph.island_is_free, [(island[i], moves[j]) for (j, i), island in edges])
 
     def advance(self, state: State, acc: Tensor) -> State:
-        """Return the next state under an acceleration [node, dim] in m/s² that includes gravity, without static friction."""
-        dt = self.builder.metadata.frame_dt
-        return state.later(dt, *integrators.advance(state.pos, state.vel, acc, dt))
+        """Return the next state under an acceleration [node, dim] in m/s² that includes gravity, without static friction. Rigid bodies keep their shape."""
+        return next_states.advanced(state, acc, self.builder.metadata.frame_dt)
 
     @classmethod
     def _check_size(cls, description: dict[str, Any], weights: dict[str, Tensor]) -> None:

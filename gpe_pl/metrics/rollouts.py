@@ -22,9 +22,10 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics import Metric
 
-from gpe_pl.metrics import bodies
+from gpe_pl.metrics import bodies, rigid
 from gpe_pl.metrics.bodies import Bodies, body_metrics
 from gpe_pl.metrics.mirror import mirror_error, mirrors
+from gpe_pl.metrics.rigid import rigid_deformation
 from gpe_pl.rollout.loop import fraction_outside
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.state import von_mises
@@ -49,6 +50,7 @@ UNITS: dict[str, str] = {
     "fraction_outside": "1",
     "mirror_error": "1",
     **bodies.UNITS,
+    **rigid.UNITS,
 }
 """Metrics of ``rollout_metrics`` and their units."""
 
@@ -286,6 +288,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     kinetic_energy_error   1      the same for absolute differences
     mirror_error           1      ‖x − Mx‖ / ‖x̂ − x̂(0)‖ with Mx the mirror image of the prediction; only if the scene is symmetric about a vertical plane
                                   (``mirror.mirrors``); the largest, if it is about several
+    rigid_deformation      1      largest change of a distance inside a rigid body, relative to the size of the body; only if the scene has rigid bodies
     fraction_outside       1      fraction of predicted particle positions deeper than a thousandth of the spacing in a wall or obstacle
     ====================== ====== ====================================================================================================
 
@@ -307,6 +310,8 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
         undefined |= {"von_mises_error", "stress_error"}
     if not ground_truth.boundary.shapes:
         undefined.add("fraction_outside")
+    if prediction.rigid_body is None:
+        undefined.add("rigid_deformation")
     names = [name for name in UNITS if name not in undefined]
     planes = mirrors(ground_truth)
     if not planes:
@@ -331,6 +336,8 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
                 values["fraction_outside"] = fraction_outside(
                     prediction.frames(1, steps + 1), tolerance=1e-3 * ground_truth.metadata.spacing
                 )
+            if "rigid_deformation" in values:
+                values["rigid_deformation"] = rigid_deformation(prediction, steps)
             if not periodic:
                 values["energy_distance"] = _cloud_distance(prediction, ground_truth, steps)
             if own_bodies is not None and true_bodies is not None:

@@ -9,6 +9,7 @@ from gpe_pl.geometry.shapes import Shape, signed_distance, surface_tolerance
 from gpe_pl.rollout.loop import Simulator
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.boundary import Array
+from gpe_pl.trajectory.rigid_bodies import moved_rigidly
 from gpe_pl.trajectory.state import State
 
 NUM_BISECTIONS = 30
@@ -77,7 +78,7 @@ def _sticking(state: State, dt: float, acceleration: Array) -> State:
         pos[rows] = _touchdown(shapes, state.pos[rows], pos[rows])
     pos = xp.where(stuck[:, None], state.pos, pos)
     vel = xp.where((hit | stuck)[:, None], xp.zeros_like(vel), vel)
-    return state.later(dt, pos, vel)
+    return moved_rigidly(state, state.later(dt, pos, vel), dt)
 
 
 def _touchdown(shapes: tuple[Shape, ...], start: Array, end: Array) -> Array:

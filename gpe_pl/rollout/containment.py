@@ -13,6 +13,7 @@ from gpe_pl.geometry.shapes import Shape, outward_normal, signed_distance, surfa
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
 from gpe_pl.system.compiled import is_wanted
 from gpe_pl.trajectory.boundary import Array, as_numpy
+from gpe_pl.trajectory.rigid_bodies import bodies_of
 from gpe_pl.trajectory.state import State
 
 
@@ -20,7 +21,8 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
     """Move nodes inside a wall or obstacle back to its surface, along the normal. Depths up to ``geometry.shapes.surface_tolerance`` are allowed.
 
     In a narrow gap between surfaces, a node may still be inside afterwards; it then returns to its position before the step. Velocities and the last entry of
-    the velocity history change by displacement / ``dt``, so that they remain differences of positions.
+    the velocity history change by displacement / ``dt``, so that they remain differences of positions. A rigid body moves as a whole, by the displacements of
+    its deepest nodes.
 
     Args:
         state: state after a step.
@@ -29,6 +31,14 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
     Returns:
         Corrected state (the same object if no node was inside) and a mask [node] of the corrected nodes.
     """
+    contained, inside = _contain_nodes(state, dt)
+    if state.rigid_body is None or contained is state:
+        return contained, inside
+    return _contain_bodies(state, contained, inside, dt)
+
+
+def _contain_nodes(state: State, dt: float) -> tuple[State, Array]:
+    """Return the results of ``contain`` for a state without rigid bodies."""
     shapes = state.boundary.shapes
     tolerance = surface_tolerance(shapes)
     if not _is_compiled(state):
@@ -71,6 +81,28 @@ def _contain_plainly(state: State, dt: float, tolerance: float) -> tuple[State, 
     new_pos[rows] = state.periodicity.wrapped(moved)
     vel[rows] = vel[rows] + (moved - pos[rows]) / dt
     return state.corrected(new_pos, vel), inside
+
+
+def _contain_bodies(state: State, contained: State, inside: Array, dt: float) -> tuple[State, Array]:
+    """Return the results of ``contain``, given those of ``_contain_nodes``. A body moves by the displacement of its deepest node until no node is inside."""
+    shapes, xp = state.boundary.shapes, array_namespace(state.pos)
+    tolerance = surface_tolerance(shapes)
+    pos, vel, moves = contained.pos + 0.0, contained.vel + 0.0, inside | False
+    for rows in bodies_of(state.rigid_body):
+        if not bool(xp.any(inside[rows])):
+            continue
+        start = _plain(state.pos[rows])
+        own = start
+        for _ in range(NUM_PASSES):
+            if not bool((signed_distance(shapes, own) < -tolerance).any()):
+                break
+            push = _on_surfaces(shapes, own, tolerance) - own
+            own = own + push[(push**2).sum(-1).argmax()]
+        if bool((signed_distance(shapes, own) < -tolerance).any()):
+            own = start - _plain(state.vel[rows]) * dt
+        pos[rows], moves[rows] = state.periodicity.wrapped(xp.asarray(own)), True
+        vel[rows] = state.vel[rows] + xp.asarray(own - start) / dt
+    return state.corrected(pos, vel), moves
 
 
 def _plain(points: Array) -> Array:

@@ -280,6 +280,7 @@ class _Recording:
             rest_pos=None if state.rest_pos is None else _numpy(state.rest_pos),
             cells=None if state.cells is None else _numpy(state.cells),
             cell_dim=state.cell_dim,
+            rigid_body=None if state.rigid_body is None else _numpy(state.rigid_body),
             stress=Stress(np.stack([s.node for s in known]), np.stack([s.cell for s in known])) if has_stress else None,
             termination=self.termination,
             start_time=state.time,

@@ -186,6 +186,23 @@ def checked_materials(
     return codes, columns, present, stored
 
 
+def checked_bodies(rigid_body: Any, num_nodes: int) -> np.ndarray:
+    """Return the number of the rigid body of each node [node], −1 for none.
+
+    Raises:
+        ArrayError: the array is not of integers, has another shape, or has a number below −1.
+    """
+    array = np.asarray(rigid_body)
+    if array.dtype.kind not in "iu" or array.shape != (num_nodes,):
+        raise ArrayError(
+            f"rigid_body: is {array.dtype}{list(array.shape)}, expected integers [node {num_nodes}], -1 for nodes of no rigid body"
+        )
+    if (array < -1).any():
+        node = int((array < -1).argmax())
+        raise ArrayError(f"rigid_body: node {node} is {array[node]}, must be -1 or the number of a body")
+    return array.astype(np.int32)
+
+
 def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, int]:
     """Return all cells of a mesh in one array [cell, corner], and their dimension: 2 for surfaces, 3 for volumes. In 2D it is 2.
 

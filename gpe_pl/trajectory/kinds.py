@@ -12,6 +12,8 @@ NODE: Kind = {"kind": "node"}
 """The field has one row per node."""
 CELL: Kind = {"kind": "cell"}
 """The field has one row per mesh cell. Its values are numbers of nodes."""
+GROUP: Kind = {"kind": "group"}
+"""The field has one row per node. Its values are numbers of groups of nodes, −1 for none."""
 SCENE: Kind = {"kind": "scene"}
 """The field has one value for the whole scene."""
 STEP: Kind = {"kind": "step"}

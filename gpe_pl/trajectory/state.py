@@ -13,7 +13,7 @@ from array_api_compat import array_namespace, device
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.trajectory.arrays import ArrayError
 from gpe_pl.trajectory.boundary import Array, Boundary
-from gpe_pl.trajectory.kinds import CELL, NODE, SCENE, STEP, names_of
+from gpe_pl.trajectory.kinds import CELL, GROUP, NODE, SCENE, STEP, names_of
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,7 @@ class State:
         internal: private data of a solver or simulator, such as deformation gradients. With it, a rollout can continue from any state as if it had not been
             interrupted. It is not stored.
         periodicity: axes along which space repeats.
+        rigid_body: number of the rigid body that each node belongs to, −1 for none [node]; None if the scene has no rigid bodies. See ``rigid_bodies``.
         param_names: names of the columns of ``material_params``; empty stands for the first parameter of each material of the data set. Solvers take the
             values of parameters without a column from their settings.
     """
@@ -104,6 +105,7 @@ class State:
     frame_velocity: Array | None = field(default=None, metadata=NODE)
     periodicity: Periodicity = field(default=NOWHERE, metadata=SCENE)
     param_names: tuple[str, ...] = field(default=(), metadata=SCENE)
+    rigid_body: Array | None = field(default=None, metadata=GROUP)
 
     @property
     def num_nodes(self) -> int:
@@ -124,7 +126,8 @@ class State:
         xp = array_namespace(self.pos)
         rows = xp.asarray(nodes, device=device(self.pos))
         rows = xp.nonzero(rows)[0] if rows.dtype == xp.bool else rows
-        values = {name: value[rows] for name in names_of(self, NODE) if (value := getattr(self, name)) is not None}
+        names = (*names_of(self, NODE), *names_of(self, GROUP))
+        values = {name: value[rows] for name in names if (value := getattr(self, name)) is not None}
         for name in names_of(self, CELL):
             if (cells := getattr(self, name)) is not None:
                 number = xp.full((self.num_nodes,), -1, dtype=xp.int64, device=device(self.pos))
@@ -145,7 +148,7 @@ class State:
         first, values = states[0], dict[str, Array]()
         xp = array_namespace(first.pos)
         starts = [0, *accumulate(state.num_nodes for state in states)]
-        for name in (*names_of(first, NODE), *names_of(first, CELL)):
+        for name in (*names_of(first, NODE), *names_of(first, GROUP), *names_of(first, CELL)):
             parts = [getattr(state, name) for state in states]
             lacking = [k for k, part in enumerate(parts) if part is None]
             if len(lacking) == len(parts):
@@ -154,6 +157,8 @@ class State:
                 raise ArrayError(f"{name}: state {lacking[0]} has none, others have; give it to all states or to none")
             if name in names_of(first, CELL):
                 parts = [part + start for part, start in zip(parts, starts, strict=False)]
+            if name in names_of(first, GROUP):  # groups are numbered on
+                parts = [xp.where(part >= 0, part + start, part) for part, start in zip(parts, _first_numbers(parts), strict=True)]
             values[name] = xp.concat(parts)
         return replace(first, **values, **_nothing_known(first))
 
@@ -205,6 +210,12 @@ class State:
         boundary = replace(self.boundary, **tensors(self.boundary))
         stress = None if self.stress is None else replace(self.stress, **tensors(self.stress))
         return replace(self, **tensors(self) | {"boundary": boundary, "stress": stress, "internal": None})
+
+
+def _first_numbers(parts: Sequence[Array]) -> list[int]:
+    """Return the number that the first group of each array [node] gets when the arrays are joined."""
+    counts = [int(array_namespace(part).max(part)) + 1 if part.shape[0] else 0 for part in parts]
+    return [0, *accumulate(counts)][:-1]
 
 
 _defaults: dict[Any, dict[str, Any]] = {}

@@ -67,6 +67,7 @@ def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
         "boundary_friction": b.friction,
         "boundary_restitution": b.restitution,
         "rest_pos": trajectory.rest_pos,
+        "rigid_body": trajectory.rigid_body,
         "cells": trajectory.cells,
         "cell_dim": None if trajectory.cells is None or trajectory.cell_dim is None else [trajectory.cell_dim],
     }
@@ -387,6 +388,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         arrays["material_params"],
         boundary,
         rest_pos=arrays.get("rest_pos"),
+        rigid_body=arrays.get("rigid_body"),
         cells=arrays.get("cells"),
         cell_dim=int(arrays["cell_dim"][0]) if "cell_dim" in arrays else None,
         stress=Stress(arrays["node_stress"], arrays["cell_stress"]) if "node_stress" in arrays else None,

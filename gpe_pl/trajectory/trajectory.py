@@ -17,6 +17,7 @@ from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.arrays import (
     RADIUS_SPACINGS,
     ArrayError,
+    checked_bodies,
     checked_bounds,
     checked_cells,
     checked_materials,
@@ -165,6 +166,7 @@ class Trajectory:
         boundary: boundary in the first frame; if it moves, its motion has as many frames as the trajectory.
         rest_pos, cells, cell_dim: reference configuration of meshes, as in ``State``.
         stress: stress of the mesh in every frame.
+        rigid_body: number of the rigid body of each node, as in ``State``.
         termination: reason why a rollout stopped early; None if it did not.
         start_time: time of the first frame since the start of the scene [s].
         is_prediction: whether the trajectory is a rollout of a simulator other than a ground-truth solver.
@@ -181,6 +183,7 @@ class Trajectory:
     cells: np.ndarray | None = None
     stress: Stress | None = None
     cell_dim: int | None = None
+    rigid_body: np.ndarray | None = None
     termination: Termination | None = field(default=None, compare=False)
     start_time: float = field(default=0.0, compare=False)
     is_prediction: bool = field(default=False, compare=False)
@@ -203,6 +206,7 @@ class Trajectory:
         boundary: Boundary | None = None,
         cells: Array | Mapping[str, Array] | None = None,
         rest_pos: Array | None = None,
+        rigid_body: Array | None = None,
         dataset: str = "arrays",
         split: str = "train",
     ) -> Trajectory:
@@ -231,6 +235,7 @@ class Trajectory:
                 them by kind if there are several kinds, or if cells in 3D have four corners, because both quadrilaterals and tetrahedra do. Kinds are those of
                 ``schema.CELL_KINDS``; the order of corners is that of VTK.
             rest_pos: undeformed positions [node, dim] of meshes in m; None takes those of the first frame.
+            rigid_body: number of the rigid body that each node belongs to [node], −1 for none. Simulators move the nodes of a body by one rigid motion.
             dataset, split: names of data set and split; ``save_dataset`` overrides both.
 
         Raises:
@@ -283,6 +288,7 @@ class Trajectory:
             rest_pos=rest_pos,
             cells=cells,
             cell_dim=cell_dim,
+            rigid_body=None if rigid_body is None else checked_bodies(rigid_body, num_nodes),
         )  # fmt: skip
 
     @property
@@ -316,7 +322,7 @@ class Trajectory:
         return State(
             pos, vel, self.node_type, self.mass, self.material_params, self.boundary.at(frame), gravity, past,
             self.start_time + frame * self.metadata.frame_dt, rest_pos, self.cells, stress, self.cell_dim, periodicity=self.metadata.periodicity,
-            param_names=self.metadata.param_names, frame_velocity=at_frame,
+            param_names=self.metadata.param_names, frame_velocity=at_frame, rigid_body=self.rigid_body,
         )  # fmt: skip
 
     def seen_from(self, origin: np.ndarray) -> Trajectory:
@@ -392,4 +398,5 @@ class Trajectory:
             boundary=replace(self.boundary.take(still), motion=None),
             rest_pos=None if self.rest_pos is None else np.concatenate([self.rest_pos, motion.pos[0, moves].astype(self.rest_pos.dtype)]),
             stress=stress,
+            rigid_body=None if self.rigid_body is None else extended(self.rigid_body, -1),
         )

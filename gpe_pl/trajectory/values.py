@@ -197,6 +197,11 @@ def _dimension_of_cells(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
         yield _Found(bad, lambda place: f"is {array[place]}, must be 2{' or 3' if dim == 3 else ''} in {dim}D")
 
 
+def _bodies(_: _Scene, array: np.ndarray) -> Iterator[_Found]:
+    if array.size and array.min() < -1:
+        yield _Found(array < -1, lambda k: f"is {array[k]}, must be -1 or the number of a body")
+
+
 _RULES: dict[str, _Rule] = {
     "finite": _finite,
     "positive": _within(SMALLEST, LARGEST, "must be positive and finite"),
@@ -206,5 +211,6 @@ _RULES: dict[str, _Rule] = {
     "node types": _node_types,
     "parameters": _parameters,
     "nodes of cells": _cells,
+    "numbers of bodies": _bodies,
     "dimension of cells": _dimension_of_cells,
 }

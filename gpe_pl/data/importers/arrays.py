@@ -56,6 +56,7 @@ KEYS = (
         "connectivity_radius",
         "cells",
         "rest_pos",
+        "rigid_body",
     ),
     *(f"boundary_{name}" for name in ("pos", "normal", "vel", "friction", "restitution")),
 )

@@ -17,7 +17,8 @@ from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
 from gpe_pl.data.importers.sampled import degrees_of, speed_and_acceleration
-from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
+from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source, walls_at_bounds
+from gpe_pl.data.importers.source import joined as with_walls
 from gpe_pl.data.position_rounding import ROUNDING_FRACTION, MotionSummary, better_origin, motion_of, rounding_fault
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.errors import GpeError
@@ -42,7 +43,7 @@ VERSION = "1"
 TRAJECTORIES_PER_SHARD = 8
 NUM_SAMPLED = 8
 """Number of trajectories from which spacing, neighbours and free flight are measured. Training trajectories come first."""
-FLIGHT_FRAMES = 25
+FLIGHT_FRAMES = 50
 """Number of frames of each sampled trajectory in which groups in free flight are searched for."""
 ENOUGH_GROUPS = 20
 """Number of groups in free flight, over all examined frames, from which the gravity of a source is measured if it does not state one."""
@@ -315,7 +316,7 @@ class _Conversion:
         survey.num_bytes += sum(array.nbytes for array in arrays.values())
         survey.bounds.append(m.bounds)
         if len(survey.flights) < NUM_SAMPLED:
-            survey.flights.append((loaded.assumes_gravity, _free_flight(trajectory)))
+            survey.flights.append((loaded.assumes_gravity, _free_flight(trajectory, self.facts)))
         if len(survey.spacings) < NUM_SAMPLED:
             survey.spacings.append(m.spacing)
             survey.distances.append(float(np.median(nearest)))
@@ -578,9 +579,14 @@ def _faults(m: Metadata, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
     yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))
 
 
-def _free_flight(trajectory: Trajectory) -> FreeFlight:
-    """Find the groups in free flight of a trajectory, in the precision of its source."""
-    b = trajectory.boundary
+def _free_flight(trajectory: Trajectory, facts: Facts) -> FreeFlight:
+    """Find the groups in free flight of a trajectory, in the precision of its source.
+
+    Walls at bounds that are not known yet are at those of the trajectory. Without them, nodes that lie on the ground would count as free.
+    """
+    b, m = trajectory.boundary, trajectory.metadata
+    if facts.bounds is None:
+        b = with_walls(m.dim, b, walls_at_bounds(replace(facts, bounds=m.bounds, spacing=m.spacing), m.dim))
     arrays = {"pos": trajectory.pos, "mass": trajectory.mass, "boundary_pos": b.pos[None] if b.motion is None else b.motion.pos}
     if trajectory.cells is not None:
         arrays["cells"] = trajectory.cells

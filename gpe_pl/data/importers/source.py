@@ -236,6 +236,8 @@ class Nodes:
         walls: positions and normals [boundary_node, dim] of additional boundary nodes.
         cells: cells of a mesh by kind [cell, corner].
         rest_pos: rest positions of a mesh [node, dim] in m.
+        rigid_body: number of the rigid body of each node, −1 for none [node].
+        moving_walls: positions and normals [frame, boundary_node, dim] of additional boundary nodes that move in a prescribed way.
         friction: friction coefficient of boundary nodes.
         repairs, notes, warnings: as in ``Loaded``.
     """
@@ -249,6 +251,8 @@ class Nodes:
     walls: tuple[np.ndarray, np.ndarray] | None = None
     cells: Mapping[str, np.ndarray] | None = None
     rest_pos: np.ndarray | None = None
+    rigid_body: np.ndarray | None = None
+    moving_walls: tuple[np.ndarray, np.ndarray] | None = None
     friction: float = ASSUMED_FRICTION
     repairs: list[Repair] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -310,6 +314,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
             boundary=boundary,
             cells=cells,
             rest_pos=None if nodes.rest_pos is None or cells is None else nodes.rest_pos[moving],
+            rigid_body=None if nodes.rigid_body is None else nodes.rigid_body[moving],
         ),
         (*repairs, *wall_repairs),
         (*notes, *wall_notes),
@@ -369,6 +374,9 @@ def _boundary(nodes: Nodes, visited: np.ndarray, facts: Facts) -> tuple[Boundary
         notes.append("normals of boundary nodes are estimated: they point to where the other nodes have been")
     if nodes.walls is not None:
         parts.append(Boundary.from_numpy(*nodes.walls, friction=nodes.friction))
+    if nodes.moving_walls is not None and facts.frame_dt is not None:
+        parts.append(Boundary.moving(*nodes.moving_walls, facts.frame_dt, friction=nodes.friction, periodicity=facts.periodicity))
+        notes.append("walls of the source move; their motion is prescribed to simulators and does not react to contacts")
     if parts:
         notes.append(f"friction of boundary nodes is not in the source; {nodes.friction:g} is stored")
     return joined(dim, *parts, walls_at_bounds(facts, dim)), repairs, notes

@@ -365,6 +365,7 @@ def test_dpinet(tmp_path: Path) -> None:
         np.testing.assert_allclose(trajectory.vel, np.gradient(pos, 1 / 60, axis=0), rtol=1e-5)
         assert trajectory.metadata.frame_dt == pytest.approx(1 / 60)
         assert trajectory.node_type.tolist() == [node_code("solid")] * 64 + [node_code("fluid")] * 16
+        np.testing.assert_array_equal(trajectory.rigid_body, [0] * 64 + [-1] * 16)
         assert trajectory.metadata.gravity == pytest.approx((0.0, -9.8, 0.0))
         assert {s.normal for s in trajectory.boundary.shapes} >= {(0.0, 1.0, 0.0), (1.0, 0.0, 0.0)}  # type: ignore[attr-defined]
     assert any("no usable test: the last 1 training trajectories" in note for note in report.notes)

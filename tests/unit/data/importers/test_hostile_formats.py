@@ -90,7 +90,19 @@ def rollouts(tmp_path: Path) -> Path:
     [
         (lambda f: (f / "4.h5").unlink(), "frame 4: has no 4.h5"),
         (lambda f: (f / "4.h5").write_bytes(b"x"), "frame 4: 4.h5: not a readable HDF5 file"),
-        (lambda f: set_arrays(f / "4.h5", shape_quats=np.zeros((2, 4))), "frame 4: has shape_quats: moving walls or grippers"),
+        (lambda f: set_arrays(f / "4.h5", shape_quats=np.zeros((2, 4))), "has shape_quats in 1 of 10 frames"),
+        (
+            lambda f: [set_arrays(p, shape_quats=np.zeros((3, 4))) for p in f.iterdir()],
+            "has shape_quats of 3 bodies and 0 scene_params, as none of FluidShake, RiceGrip and RigidFall",
+        ),
+        (
+            lambda f: [set_arrays(p, shape_quats=np.zeros((2, 4)), scene_params=np.zeros(6)) for p in f.iterdir()],
+            "shape_quats has a quaternion of length 0",
+        ),
+        (
+            lambda f: [set_arrays(p, shape_quats=np.zeros((1, 4)), scene_params=np.array([1e300, 0])) for p in f.iterdir()],
+            "has 19 nodes, expected 64 for each of 0 cubes of scene_params",
+        ),
         (lambda f: set_arrays(f / "4.h5", positions=np.zeros((7, 3), "f4")), r"frame 4: positions is \[7, 3\], expected \[20, 3\]"),
         (lambda f: set_arrays(f / "0.h5", positions=np.zeros((20, 6), "f4")), r"frame 0: positions is \[20, 6\], expected \[20, 3\]"),
         (lambda f: set_arrays(f / "0.h5", clusters=np.zeros(3, int)), "has clusters, as BoxBath, but only 20 nodes"),

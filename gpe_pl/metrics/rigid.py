@@ -1,0 +1,32 @@
+"""Deformation of rigid bodies in a rollout."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.distance import pdist
+
+from gpe_pl.trajectory.rigid_bodies import bodies_of
+from gpe_pl.trajectory.trajectory import Trajectory
+
+MAX_COMPARED = 64
+"""Maximum number of nodes of a body between which distances are compared; they are spread evenly over its rows."""
+
+UNITS: dict[str, str] = {"rigid_deformation": "1"}
+
+
+def rigid_deformation(trajectory: Trajectory, num_steps: int) -> float:
+    """Return the largest change of a distance inside a rigid body over frames 1 to ``num_steps``, relative to the size of the body.
+
+    The size of a body is its largest distance in frame 0. Bodies of one node do not deform.
+    """
+    assert trajectory.rigid_body is not None
+    largest, space = 0.0, trajectory.metadata.periodicity
+    for rows in bodies_of(trajectory.rigid_body):
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, MAX_COMPARED).astype(int))]
+        if len(rows) < 2:
+            continue
+        pos = trajectory.pos[: num_steps + 1, rows].astype(np.float64)
+        pos = pos[:, :1] + space.shortest(pos - pos[:, :1])
+        distances = np.stack([pdist(frame) for frame in pos])
+        largest = max(largest, float(np.abs(distances[1:] - distances[0]).max() / distances[0].max()))
+    return largest

@@ -1,0 +1,92 @@
+"""Rigid cubes, grippers and shaken boxes of DPI-Net and its successor are read as rigid bodies and moving walls."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.trajectory.boundary import BoundaryMotion
+from gpe_pl.trajectory.trajectory import Trajectory
+from tests import sources
+from tests.sources import motion
+from tests.unit.data.importers.test_formats import imported
+
+FRAME_DT = 1 / 60
+
+
+def motion_of(trajectory: Trajectory) -> BoundaryMotion:
+    assert trajectory.boundary.motion is not None
+    return trajectory.boundary.motion
+
+
+def test_rigid_cubes(tmp_path: Path) -> None:
+    for k in range(3):
+        pos = motion(num_nodes=128, dim=3, seed=k)
+        with_ground = np.concatenate([pos, np.zeros((len(pos), 1, 3), np.float32)], axis=1)
+        scene = np.array([2.0, -7.5 - k, *np.zeros(6), 1.0])
+        quats = np.zeros((1, 4), np.float32)
+        sources.dpinet(tmp_path / "data_RigidFall" / str(k), with_ground, None, shape_quats=quats, scene_params=scene)
+    report, stored = imported(tmp_path, tmp_path / "data_RigidFall", "dpinet")
+    (trajectory,) = stored["train"]
+    np.testing.assert_array_equal(trajectory.rigid_body, np.repeat([0, 1], 64))
+    assert trajectory.metadata.materials == ("solid",)
+    assert trajectory.metadata.gravity == (0.0, -7.5, 0.0)
+    assert [s.normal for s in trajectory.boundary.shapes] == [(0.0, 1.0, 0.0)]  # type: ignore[attr-defined]
+    assert not any("gravity is not in the source" in note for note in report.notes)
+
+
+def turned(angle: float) -> np.ndarray:
+    """Return the quaternion of a turn about the y axis, the scalar part last."""
+    return np.array([0.0, np.sin(angle / 2), 0.0, np.cos(angle / 2)], np.float32)
+
+
+def test_grippers_are_moving_walls(tmp_path: Path) -> None:
+    for k in range(3):
+        pos = motion(num_nodes=60, dim=3, seed=k)
+        centres = np.zeros((len(pos), 2, 3), np.float32)
+        centres[:, 0], centres[:, 1] = [-0.9, 0.6, 0.0], [0.9, 0.6, 0.0]
+        centres[:, 0, 0] += 0.3 * np.sin(np.arange(len(pos)) / 3)
+        world = np.concatenate([pos, centres], axis=1)
+        both = np.concatenate([0 * world, world], axis=2)
+        extra = {"shape_quats": np.stack([turned(0.5), turned(0.0)]), "scene_params": np.array([9.0, 9.0, 9.0, 0.4, 0.3, 0.2])}
+        folder = tmp_path / "data_RiceGrip" / "train" / str(k)
+        sources.dpinet(folder, both, np.gradient(both, FRAME_DT, axis=0), clusters=np.zeros((1, 1, 1, 60)), **extra)
+    report, stored = imported(tmp_path, tmp_path / "data_RiceGrip", "dpinet", spacing=0.1)
+    (trajectory,) = stored["train"]
+    np.testing.assert_allclose(trajectory.pos, motion(num_nodes=60, dim=3, seed=0))
+    assert trajectory.metadata.param_names == ("hardening_coefficient", "critical_compression", "critical_stretch")
+    np.testing.assert_allclose(trajectory.material_params[0], [0.4, 0.3, 0.2], rtol=1e-6)
+    walls = motion_of(trajectory)
+    moves = np.ptp(walls.pos, axis=0)[:, 0] > 0.1
+    first, second = walls.pos[0, moves], walls.pos[0, ~moves & (walls.pos[0, :, 0] > 0.7)]
+    assert first[:, 1].min() >= 0 and 1.3 < first[:, 1].max() < 1.4 + 1e-6
+    wide = 0.15 * (np.cos(0.5) + np.sin(0.5))  # half the width of the turned box
+    np.testing.assert_allclose([first[:, 0].min(), first[:, 0].max()], [-0.9 - wide, -0.9 + wide], atol=0.03)
+    np.testing.assert_allclose([second[:, 0].min(), second[:, 0].max()], [0.75, 1.05], atol=0.01)
+    away = (walls.normal[0, moves] * (first - first.mean(axis=0))).sum(axis=1)
+    assert (away > 0).mean() > 0.9
+    assert any("clusterStiffness" in note for note in report.notes)
+
+
+def test_a_shaken_box_moves(tmp_path: Path) -> None:
+    width, depth = 0.7, 0.2
+    side, face, middle = width / 2 + 0.0125, depth / 2 + 0.0125, 0.5125
+    box = np.array([[0, 0.0125, 0], [-side, middle, 0], [side, middle, 0], [0, middle, -face], [0, middle, face]])
+    for k in range(3):
+        pos = motion(num_nodes=40, dim=3, seed=k)
+        shaken = box + 0.2 * np.sin(np.arange(len(pos)) / 3)[:, None, None] * [1.0, 0.0, 0.0]
+        both = np.concatenate([pos, shaken.astype(np.float32)], axis=1)
+        extra = {
+            "shape_quats": np.tile([1.0, 0, 0, 0], (5, 1)).astype(np.float32),
+            "scene_params": np.array([0, 0, 0, 10, 17, 3, width, depth]),
+        }
+        sources.dpinet(tmp_path / "data_FluidShake" / "train" / str(k), both, np.gradient(both, FRAME_DT, axis=0), **extra)
+    _, stored = imported(tmp_path, tmp_path / "data_FluidShake", "dpinet", spacing=0.05)
+    (trajectory,) = stored["train"]
+    assert not trajectory.boundary.shapes
+    walls = motion_of(trajectory)
+    np.testing.assert_allclose(walls.pos[0].min(axis=0), [-width / 2 - 0.025, 0, -0.125], atol=1e-6)
+    np.testing.assert_allclose(walls.pos[0].max(axis=0), [width / 2 + 0.025, 1.025, 0.125], atol=1e-6)
+    way = np.tile([0.2 * np.sin(5 / 3), 0, 0], (walls.pos.shape[1], 1))
+    np.testing.assert_allclose(walls.pos[5] - walls.pos[0], way, atol=1e-6)
