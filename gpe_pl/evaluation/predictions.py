@@ -175,7 +175,11 @@ def start_of(simulator: LearnedSimulator | LearnedEnsemble, start_frame: int, tr
     across = size / (trajectory.num_frames * truth.metadata.frame_dt)  # the reference where everything rests
     speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
     guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, across), bounds=bounds, margin=size, spacing=truth.metadata.spacing)
-    return Start(simulator.initial_state(trajectory, start_frame), truth.num_frames - 1, truth.metadata, guard)
+    if start_frame < simulator.builder.config.history:
+        initial = simulator.standing(trajectory.state(start_frame), trajectory.metadata)
+    else:
+        initial = simulator.initial_state(trajectory, start_frame)
+    return Start(initial, truth.num_frames - 1, truth.metadata, guard)
 
 
 def _cost_of_skipping(prediction: Trajectory, exact: Trajectory, totals: dict[str, float]) -> dict[str, float]:

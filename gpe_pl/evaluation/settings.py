@@ -26,7 +26,7 @@ class EvaluationSettings:
         horizons: horizons [s], each at the nearest frame (see ``horizons``); the full length is always added.
         num_trajectories: number of trajectories per split, from its start; None takes all.
         start_time: time at which rollouts start [s]. Set it to compare models with different histories or frames from the same instant. None takes the first
-            frame with enough history.
+            frame with enough history. 0 starts at the first frame of short data: all velocities of the history are then the stored velocity of that frame.
         containment: put particles that cross a wall back on its surface.
         num_uncontained: number of trajectories per split that are also rolled out without containment, which shows what it corrects; None takes all.
         clamp_parameters: clamp material parameters outside the trained range to the nearest trained value.
@@ -41,7 +41,7 @@ class EvaluationSettings:
     splits: Annotated[list[Split], Field(min_length=1)] = field(default_factory=lambda: ["test", "test_unseen"])
     horizons: list[Annotated[float, Field(gt=0)]] = field(default_factory=lambda: [0.025, 0.1, 0.25, 0.5])
     num_trajectories: Annotated[int, Field(ge=1)] | None = None
-    start_time: Annotated[float, Field(gt=0)] | None = None
+    start_time: Annotated[float, Field(ge=0)] | None = None
     containment: bool = True
     num_uncontained: Annotated[int, Field(ge=0)] | None = None
     clamp_parameters: bool = True
@@ -58,6 +58,8 @@ class EvaluationSettings:
         """
         if self.start_time is None:
             return history
+        if self.start_time == 0:
+            return 0
         frame, key = round(self.start_time / frame_dt), f"evaluation.start_time={self.start_time:g}"
         if frame < history:
             raise StartError(

@@ -132,7 +132,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
         relations=relations,
         odd_channels={r: odd for r, (odd, _) in channels.items()},
         even_channels={r: even for r, (_, even) in channels.items()},
-        stress_channels={"solid": 4 if dim == 2 else 6} if "solid" in materials else {},
+        stress_channels=dict.fromkeys(metadata.with_stress, 4 if dim == 2 else 6),
         num_levels=num_levels,
         islands=config.islands,
         cells=config.cells,

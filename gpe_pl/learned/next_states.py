@@ -105,7 +105,7 @@ def with_frame_velocity(states: list[State], rows: Sequence[Rows], predicted: di
 
 
 def with_stress(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor], unit: Tensor, components: int) -> list[State]:
-    """Return states with the stresses that a model predicts. States without cells are returned unchanged.
+    """Return states with the stresses that a model predicts, also in their cells if they have some.
 
     Args:
         states: the states one frame later, as ``moved`` returns them.
@@ -123,7 +123,7 @@ def with_stress(states: list[State], rows: Sequence[Rows], predicted: dict[str, 
             node[scene][own] = part.double() * unit
     means = _mean_over_corners if compiled else mean_over_corners
     return [
-        state if state.cells is None else replace(state, stress=Stress(n, means(n, state.cells)))
+        replace(state, stress=Stress(n, n.new_empty(0, components) if state.cells is None else means(n, state.cells)))
         for state, n in zip(states, node, strict=True)
     ]
 

@@ -94,10 +94,15 @@ ATTRIBUTES = ("metadata", "shapes", "node_types")
 """Attributes of every trajectory's group, besides the digest."""
 
 
+OPTIONAL = ("stress_materials",)
+"""Metadata that are stored only if they are not None."""
+
+
 def stored_attributes(trajectory: Trajectory) -> dict[str, str]:
     """Return the attributes of a trajectory as JSON: metadata, shapes of its boundary, names of the ``node_type`` codes, and a start time other than 0."""
     m = trajectory.metadata
-    meta = json.dumps(asdict(m), sort_keys=True)
+    values = {name: value for name, value in asdict(m).items() if name not in OPTIONAL or value is not None}
+    meta = json.dumps(values, sort_keys=True)
     shapes = json.dumps([shape_to_dict(s) for s in trajectory.boundary.shapes], sort_keys=True)
     begins = {START_TIME: repr(float(trajectory.start_time))} if trajectory.start_time else {}
     return {"metadata": meta, "shapes": shapes, "node_types": json.dumps(NODE_TYPES), **begins}
@@ -274,7 +279,7 @@ def metadata_of(group: h5py.Group) -> Metadata:
         text = read_text(group, "metadata")
         values = parsed(text)
         known = {f.name for f in fields(Metadata)}
-        if not isinstance(values, dict) or set(values) != known:
+        if not isinstance(values, dict) or {*values, *OPTIONAL} != known:
             raise ValueError(f"keys {sorted(set(values) ^ known)} missing or unknown")
         return TypeAdapter(Metadata).validate_json(text, strict=True)
     except StoreError:

@@ -29,6 +29,7 @@ from gpe_pl.trajectory.arrays import (
     velocities_of,
 )
 from gpe_pl.trajectory.boundary import Array, Boundary, check_steps
+from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.state import State, Stress
 
 
@@ -52,6 +53,7 @@ class Metadata:
         parameter_group: ``seen`` if all material parameters have trained values, ``extrapolated`` if any lies outside the trained range, otherwise
             ``interpolated``.
         solver, solver_version, config: provenance; ``config`` is JSON.
+        stress_materials: materials whose nodes have a stress; None stands for ``solid``, the material of the FEM solver.
     """
 
     dataset: str
@@ -70,10 +72,13 @@ class Metadata:
     solver: str = ""
     solver_version: str = ""
     config: str = "{}"
+    stress_materials: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "materials", tuple(self.materials))
         object.__setattr__(self, "param_names", tuple(self.param_names))
+        if self.stress_materials is not None:
+            object.__setattr__(self, "stress_materials", tuple(self.stress_materials))
         object.__setattr__(self, "bounds", tuple((float(a), float(b)) for a, b in self.bounds))
         object.__setattr__(self, "gravity", tuple(float(g) for g in self.gravity))
         object.__setattr__(self, "periodic", tuple(bool(p) for p in self.periodic) or (False,) * len(self.bounds))
@@ -81,6 +86,11 @@ class Metadata:
     @property
     def dim(self) -> int:
         return len(self.bounds)
+
+    @property
+    def with_stress(self) -> tuple[str, ...]:
+        """Materials of the data set whose nodes have a stress."""
+        return tuple(m for m in self.materials if m in (self.stress_materials if self.stress_materials is not None else ("solid",)))
 
     @property
     def longest_side(self) -> float:
@@ -110,6 +120,8 @@ class Metadata:
             yield "materials", f"names {unknown or 'nothing'}; known: {', '.join(MATERIALS)}"
         elif len(set(self.materials)) < len(self.materials):
             yield "materials", "names a material twice"
+        elif not {*(self.stress_materials or ())} <= {*self.materials}:
+            yield "stress_materials", f"names {self.stress_materials}, the materials are {self.materials}"
         elif self.param_names != param_names(self.materials, self.param_names):
             first, every = param_names(self.materials), param_names(self.materials, (p.name for m in self.materials for p in MATERIALS[m]))
             also = f" and possibly more, in the order {every}" if every != first else ""
@@ -134,6 +146,24 @@ class Metadata:
                 yield "connectivity_radius", str(error)
         if not all(map(math.isfinite, self.gravity)):
             yield "gravity", f"is {self.gravity}, must be finite"
+
+
+def checked_stress(stress: Array, pos: np.ndarray, cells: np.ndarray | None) -> Stress:
+    """Return the stress of a trajectory in single precision. Stresses of cells are means over their corners.
+
+    Args:
+        stress: Cauchy stress at nodes [frame, node, component] in Pa.
+        pos: positions [frame, node, dim] in m.
+        cells: nodes of each cell [cell, corner]; None without a mesh.
+
+    Raises:
+        ArrayError: the array has another shape, or a number is not finite.
+    """
+    components = 4 if pos.shape[2] == 2 else 6
+    node = numbers("stress", stress, {"frame": pos.shape[0], "node": pos.shape[1], "component": components}).astype(np.float32)
+    if cells is None:
+        return Stress(node, np.zeros((len(node), 0, components), np.float32))
+    return Stress(node, np.stack([mean_over_corners(frame, cells) for frame in node]))
 
 
 @dataclass(frozen=True)
@@ -207,6 +237,7 @@ class Trajectory:
         cells: Array | Mapping[str, Array] | None = None,
         rest_pos: Array | None = None,
         rigid_body: Array | None = None,
+        stress: Array | None = None,
         dataset: str = "arrays",
         split: str = "train",
     ) -> Trajectory:
@@ -236,6 +267,8 @@ class Trajectory:
                 ``schema.CELL_KINDS``; the order of corners is that of VTK.
             rest_pos: undeformed positions [node, dim] of meshes in m; None takes those of the first frame.
             rigid_body: number of the rigid body that each node belongs to [node], −1 for none. Simulators move the nodes of a body by one rigid motion.
+            stress: Cauchy stress at the nodes [frame, node, component] in Pa, with the components of ``State.stress``. Models can learn it
+                (``model.stress=true``). Give a material without a stress zeros; it counts as having none.
             dataset, split: names of data set and split; ``save_dataset`` overrides both.
 
         Raises:
@@ -274,10 +307,12 @@ class Trajectory:
             rest_pos = numbers("rest_pos", pos[0] if rest_pos is None else rest_pos, {"node": num_nodes, "dim": dim}).astype(pos.dtype)
         elif rest_pos is not None:
             raise ArrayError("rest_pos: only meshes have rest positions; pass cells too, or leave it out")
+        known = None if stress is None else checked_stress(stress, pos, cells)
         return cls(
             Metadata(
                 dataset, names, stored, frame_dt, spacing, radius, bounds, tuple(map(float, gravity)),
                 periodicity.periodic, split=split, solver="import", solver_version="1",
+                stress_materials=() if known is None else tuple(m for m in names if known.node[:, codes == node_code(m)].any()),
             ),
             pos,
             numbers("vel", vel, shape).astype(np.float32, copy=False),
@@ -287,6 +322,7 @@ class Trajectory:
             boundary,
             rest_pos=rest_pos,
             cells=cells,
+            stress=known,
             cell_dim=cell_dim,
             rigid_body=None if rigid_body is None else checked_bodies(rigid_body, num_nodes),
         )  # fmt: skip

@@ -57,6 +57,7 @@ KEYS = (
         "cells",
         "rest_pos",
         "rigid_body",
+        "stress",
     ),
     *(f"boundary_{name}" for name in ("pos", "normal", "vel", "friction", "restitution")),
 )

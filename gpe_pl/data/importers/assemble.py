@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.data.checksum import split_checksum
-from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
+from gpe_pl.data.free_flight import FreeFlight, joined, vector
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
-from gpe_pl.data.importers.sampled import degrees_of, speed_and_acceleration
-from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source, walls_at_bounds
-from gpe_pl.data.importers.source import joined as with_walls
+from gpe_pl.data.importers.sampled import degrees_of, free_flight_of, speed_and_acceleration
+from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
+from gpe_pl.data.importers.splits import arranged
 from gpe_pl.data.position_rounding import ROUNDING_FRACTION, MotionSummary, better_origin, motion_of, rounding_fault
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.errors import GpeError
@@ -43,8 +43,6 @@ VERSION = "1"
 TRAJECTORIES_PER_SHARD = 8
 NUM_SAMPLED = 8
 """Number of trajectories from which spacing, neighbours and free flight are measured. Training trajectories come first."""
-FLIGHT_FRAMES = 50
-"""Number of frames of each sampled trajectory in which groups in free flight are searched for."""
 ENOUGH_GROUPS = 20
 """Number of groups in free flight, over all examined frames, from which the gravity of a source is measured if it does not state one."""
 NUM_SHOWN = 4
@@ -56,6 +54,8 @@ SPACING_RATIO = 3.0
 """A warning is given if the spacing and the distance of nearest nodes differ by more than this factor."""
 LONG_ENOUGH = HISTORY + 2
 """Number of frames that a model needs with the default history."""
+SHORT = 10 * HISTORY
+"""With fewer frames, the report says how to use more of them."""
 COINCIDENCE = 1e-3
 """Nodes closer than this fraction of the median distance to the nearest node, in the first frame, count as at one place."""
 VELOCITY_RATIO = 1.25
@@ -85,7 +85,7 @@ def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Prog
     if settings.materials and settings.format not in TYPED:
         raise ImportFailure(f"materials={settings.materials}: {settings.format} has no node types; {', '.join(TYPED)} have")
     module = importlib.import_module(f"gpe_pl.data.importers.{settings.format}")
-    source = module.open_source(path, settings)
+    source = arranged(module.open_source(path, settings), settings)
     if settings.max_trajectories is not None:
         source = replace(source, splits={split: items[: settings.max_trajectories] for split, items in source.splits.items()})
     about = {
@@ -181,6 +181,7 @@ class _Survey:
         good: usable trajectories by split.
         materials: materials of all trajectories.
         columns: names of the parameters of all trajectories.
+        stressed: materials with a stress in any trajectory.
         bounds: bounds of each trajectory, ``(low, high)`` per axis [m].
         spacings, distances, radii: spacing, median distance to the nearest node, and connectivity radius of each sampled trajectory [m].
         velocity_ratios: mean displacement over mean velocity × frame interval, of each sampled trajectory.
@@ -196,6 +197,7 @@ class _Survey:
     good: dict[str, list[Item]] = field(default_factory=dict)
     materials: set[str] = field(default_factory=set)
     columns: set[str] = field(default_factory=set)
+    stressed: set[str] = field(default_factory=set)
     bounds: list[tuple[tuple[float, float], ...]] = field(default_factory=list)
     spacings: list[float] = field(default_factory=list)
     distances: list[float] = field(default_factory=list)
@@ -313,10 +315,11 @@ class _Conversion:
             survey.suspects.append(Event(split, name, 0, what))
         survey.materials |= set(m.materials)
         survey.columns |= set(m.param_names)
+        survey.stressed |= set(m.with_stress if trajectory.stress is not None else ())
         survey.num_bytes += sum(array.nbytes for array in arrays.values())
         survey.bounds.append(m.bounds)
         if len(survey.flights) < NUM_SAMPLED:
-            survey.flights.append((loaded.assumes_gravity, _free_flight(trajectory, self.facts)))
+            survey.flights.append((loaded.assumes_gravity, free_flight_of(trajectory, self.facts)))
         if len(survey.spacings) < NUM_SAMPLED:
             survey.spacings.append(m.spacing)
             survey.distances.append(float(np.median(nearest)))
@@ -500,10 +503,14 @@ class _Conversion:
                 raise Refusal(
                     f"has no {lacking[0]} of {material}, which other trajectories have; give it to all, or choose parameters={{{material}: …}}"
                 )
+        stressed = tuple(name for name in materials if name in self.survey.stressed)
+        if stressed and trajectory.stress is None:
+            raise Refusal("has no stress, which other trajectories have; give it to all or to none")
         metadata = replace(
-            m, dataset=self.report.name, materials=materials, param_names=names, spacing=facts.spacing, connectivity_radius=facts.connectivity_radius,
-            split=split, parameter_group=self._parameter_group(columns, names) if split == "test_unseen" else "seen",
-            solver=f"import/{self.about['format']}", solver_version=VERSION, config=json.dumps(self.about, sort_keys=True, default=str),
+            m, dataset=self.report.name, materials=materials, stress_materials=stressed, param_names=names, spacing=facts.spacing,
+            connectivity_radius=facts.connectivity_radius, split=split,
+            parameter_group=self._parameter_group(columns, names) if split == "test_unseen" else "seen", solver=f"import/{self.about['format']}",
+            solver_version=VERSION, config=json.dumps(self.about, sort_keys=True, default=str),
         )  # fmt: skip
         return replace(trajectory, metadata=metadata, material_params=columns)
 
@@ -543,6 +550,12 @@ class _Conversion:
         statistics = combined([shard_moments(path)[1] for path in shards])
         sealed.write(folder / STATISTICS_FILE, {**statistics, "data_sha256": split_checksum(folder, split)})
         report = self.report
+        shortest = min(counts.frames[0] for counts in report.splits.values())
+        if shortest < SHORT:
+            report.notes.append(
+                f"trajectories have {shortest} frames or more, of which the default graph.history={HISTORY} takes {HISTORY} before a model can start; "
+                "graph.history=1 takes one, and evaluation.start_time=0 starts at the first frame with its stored velocities"
+            )
         report.velocity_std, report.acceleration_std = statistics["velocity_std"], statistics["acceleration_std"]
         if report.acceleration_std == 0:
             raise ImportFailure(
@@ -577,17 +590,3 @@ def _faults(m: Metadata, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
     yield from (f"{key} {violation}" for key, violation in m.violations())
     yield from size_conflicts(arrays, m.dim, len(m.param_names))
     yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))
-
-
-def _free_flight(trajectory: Trajectory, facts: Facts) -> FreeFlight:
-    """Find the groups in free flight of a trajectory, in the precision of its source.
-
-    Walls at bounds that are not known yet are at those of the trajectory. Without them, nodes that lie on the ground would count as free.
-    """
-    b, m = trajectory.boundary, trajectory.metadata
-    if facts.bounds is None:
-        b = with_walls(m.dim, b, walls_at_bounds(replace(facts, bounds=m.bounds, spacing=m.spacing), m.dim))
-    arrays = {"pos": trajectory.pos, "mass": trajectory.mass, "boundary_pos": b.pos[None] if b.motion is None else b.motion.pos}
-    if trajectory.cells is not None:
-        arrays["cells"] = trajectory.cells
-    return joined(free_flights(trajectory.metadata, arrays, FLIGHT_FRAMES), trajectory.metadata.dim)

@@ -1,16 +1,22 @@
-"""Neighbours and motion of nodes in some stored trajectories of an import."""
+"""Neighbours and motion of nodes in some trajectories of an import."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Int64
 
+from gpe_pl.data.free_flight import FreeFlight, free_flights, joined
+from gpe_pl.data.importers.source import Facts, walls_at_bounds
+from gpe_pl.data.importers.source import joined as with_walls
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.trajectory import Trajectory
 
+FLIGHT_FRAMES = 50
+"""Number of frames of each sampled trajectory in which groups in free flight are searched for."""
 FRAMES_SAMPLED = 3
 """Number of frames of each sampled trajectory, evenly spread, in which neighbours are counted."""
 
@@ -37,3 +43,17 @@ def speed_and_acceleration(sample: Sequence[Trajectory]) -> tuple[float, list[fl
         means.append((final - first).mean(axis=0) / ((last - 1) * m.frame_dt))
         fastest = max(fastest, float(np.linalg.norm(trajectory.vel, axis=-1).max()))
     return fastest, np.mean(means, axis=0).tolist()
+
+
+def free_flight_of(trajectory: Trajectory, facts: Facts) -> FreeFlight:
+    """Find the groups in free flight of a trajectory, in the precision of its source.
+
+    Walls at bounds that are not known yet are at those of the trajectory. Without them, nodes that lie on the ground would count as free.
+    """
+    b, m = trajectory.boundary, trajectory.metadata
+    if facts.bounds is None:
+        b = with_walls(m.dim, b, walls_at_bounds(replace(facts, bounds=m.bounds, spacing=m.spacing), m.dim))
+    arrays = {"pos": trajectory.pos, "mass": trajectory.mass, "boundary_pos": b.pos[None] if b.motion is None else b.motion.pos}
+    if trajectory.cells is not None:
+        arrays["cells"] = trajectory.cells
+    return joined(free_flights(trajectory.metadata, arrays, FLIGHT_FRAMES), trajectory.metadata.dim)

@@ -21,7 +21,7 @@ from gpe_pl.files.json_text import parsed
 from gpe_pl.files.names import DataName
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.geometry.shapes import domain_walls
-from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, MaterialValues, parameters_by_name
+from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, MaterialValues, Split, parameters_by_name
 from gpe_pl.trajectory.arrays import estimated_normals, numbers
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -78,6 +78,8 @@ class ImportSettings:
         materials: material, or ``boundary``, of node types of the source, by their number. Other types keep the material of the format.
         parameters: parameters by material: a number for the first one, or several by name. Values that a trajectory of the source has itself override them.
         max_trajectories: maximum number of trajectories per split, from its start.
+        splits: numbers of the trajectories of each split, from 0 over all trajectories of the source; see ``splits.arranged``.
+        leave_out: number of the trajectory that becomes ``test``, while all others are for training; one number after the other gives a leave-one-out test.
         holdout: fraction of the training trajectories that becomes each of ``val`` and ``test`` if the source has none, at least one trajectory; 0 for none.
         allow_pickle: read object arrays, which can run code. Use it only for files that you trust.
     """
@@ -95,6 +97,8 @@ class ImportSettings:
     materials: dict[int, str] | None = None
     parameters: dict[str, float | dict[str, float]] | None = None
     max_trajectories: Annotated[int, Field(ge=1)] | None = None
+    splits: dict[Split, list[Annotated[int, Field(ge=0)]]] | None = None
+    leave_out: Annotated[int, Field(ge=0)] | None = None
     holdout: Annotated[float, Field(ge=0, le=0.4)] = 0.1
     allow_pickle: bool = False
 
