@@ -22,8 +22,9 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics import Metric
 
-from gpe_pl.metrics import bodies, rigid
+from gpe_pl.metrics import bodies, liquids, rigid
 from gpe_pl.metrics.bodies import Bodies, body_metrics
+from gpe_pl.metrics.liquids import liquid_metrics, liquid_nodes
 from gpe_pl.metrics.mirror import mirror_error, mirrors
 from gpe_pl.metrics.rigid import rigid_deformation
 from gpe_pl.rollout.loop import fraction_outside
@@ -51,6 +52,7 @@ UNITS: dict[str, str] = {
     "mirror_error": "1",
     **bodies.UNITS,
     **rigid.UNITS,
+    **liquids.UNITS,
 }
 """Metrics of ``rollout_metrics`` and their units."""
 
@@ -293,7 +295,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     ====================== ====== ====================================================================================================
 
     Energy distance and angular momentum are undefined in periodic domains and left out. ``fraction_outside`` is left out if the boundary has no shapes. Meshes
-    also have the metrics of ``bodies.body_metrics``.
+    also have the metrics of ``bodies.body_metrics``, and liquids those of ``liquids.liquid_metrics`` in frame h.
 
     Args:
         prediction: rollout from frame 0 of the ground truth.
@@ -310,6 +312,8 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
         undefined |= {"von_mises_error", "stress_error"}
     if not ground_truth.boundary.shapes:
         undefined.add("fraction_outside")
+    liquid = liquid_nodes(ground_truth)
+    undefined |= {*(liquids.WHOLE if periodic else ())} if liquid.any() else {*liquids.UNITS}
     if prediction.rigid_body is None:
         undefined.add("rigid_deformation")
     names = [name for name in UNITS if name not in undefined]
@@ -336,6 +340,9 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
                 values["fraction_outside"] = fraction_outside(
                     prediction.frames(1, steps + 1), tolerance=1e-3 * ground_truth.metadata.spacing
                 )
+            if liquid.any():
+                own, true = (t.pos[steps, liquid] for t in (prediction, ground_truth))
+                values |= liquid_metrics(own, true, ground_truth.mass[liquid], ground_truth.metadata)
             if "rigid_deformation" in values:
                 values["rigid_deformation"] = rigid_deformation(prediction, steps)
             if not periodic:

@@ -56,6 +56,24 @@ BODY_COLUMNS = {
     "mirror_error": "mirror error",
 }
 """Metrics of whole rollouts in the table of bodies, with their headings."""
+BODY_NOTE = (
+    "Bodies over whole rollouts. Ratios are to the ground truth: 1 is right, 0 is a rigid body, no bounce or no stress. Errors are relative: 1 is the "
+    "error of a rigid body or of no stress. Deformation is what the best rigid motion of a body leaves. Means are over seeds and over the trajectories "
+    "whose ground truth has the quantity, with intervals as above."
+)
+
+LIQUID_COLUMNS = {
+    "spacing_error": "spacing",
+    "density_error": "density",
+    "volume_error": "volume",
+    "centre_error": "centre of mass [m]",
+    "spread_error": "spread",
+}
+"""Metrics of ``metrics.liquids`` in a table, with their headings."""
+LIQUID_NOTE = (
+    "Liquids in the last frame: relative errors of the distance between nearest nodes, of the density, of the volume and of the spread, and the distance of "
+    "the centres of mass. None depends on which node is where."
+)
 SWEEP_MD = "table.md"
 FORWARD_TIMES = "forward_times.json"
 Variant = tuple[str, ...]
@@ -201,7 +219,8 @@ def _markdown(axes: list[str], variants: dict[Variant, list[Run]], ratios: dict[
             "",
             *_rollout_table(names, variants, first),
             *_stress_table(names, variants),
-            *_body_table(names, variants),
+            *_metric_table(names, variants, BODY_COLUMNS, BODY_NOTE),
+            *_metric_table(names, variants, LIQUID_COLUMNS, LIQUID_NOTE),
             *(["", *strides] if (strides := stride_lines(axes, variants)) else []),
             *(["", *lines] if (lines := material_lines(_material_groups(variants))) else []),
             "",
@@ -300,11 +319,11 @@ def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[
     return [*lines, "", note]
 
 
-def _body_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[str]:
-    """Return a table of the metrics of bodies that bend over whole rollouts; empty if no variant has any."""
+def _metric_table(names: list[str], variants: dict[Variant, list[Run]], headings: dict[str, str], note: str) -> list[str]:
+    """Return a table of some metrics over whole rollouts; empty if no variant has the first of them."""
     measured = {metric for runs in variants.values() for run in runs for metric in run.rows["metric"].unique()}
-    columns = {metric: heading for metric, heading in BODY_COLUMNS.items() if metric in measured}
-    if "deformation_ratio" not in columns:
+    columns = {metric: heading for metric, heading in headings.items() if metric in measured}
+    if next(iter(headings)) not in columns:
         return []
     header = [*names, "split", *columns.values()]
     lines = ["", table_row(header), "|" + "---|" * len(header)]
@@ -312,11 +331,6 @@ def _body_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[st
         for split in splits_of(runs[0]):
             cells = [_interval(values_by_seed(runs, LEARNED, split, metric, "full")) for metric in columns]
             lines.append(table_row([*(key or (LEARNED,)), split, *cells]))
-    note = (
-        "Bodies over whole rollouts. Ratios are to the ground truth: 1 is right, 0 is a rigid body, no bounce or no stress. Errors are relative: 1 is the "
-        "error of a rigid body or of no stress. Deformation is what the best rigid motion of a body leaves. Means are over seeds and over the trajectories "
-        "whose ground truth has the quantity, with intervals as above."
-    )
     return [*lines, "", note]
 
 

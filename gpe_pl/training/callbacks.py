@@ -13,8 +13,9 @@ from lightning.pytorch.callbacks import Callback, WeightAveraging
 from torch.autograd.graph import increment_version
 
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.metrics import per_frame_mse
+from gpe_pl.metrics import liquids, per_frame_mse
 from gpe_pl.metrics.bodies import Bodies, body_metrics
+from gpe_pl.metrics.liquids import liquid_metrics, liquid_nodes
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Start, rollouts
@@ -78,7 +79,8 @@ class RolloutValidation(Callback):
     """Rolls the current (averaged) model out on validation trajectories and logs the position MSE [m²] as ``val/rollout_mse``.
 
     If a rollout stops early, each missing frame has the error of the squared longest side of the domain. Meshes also get ``val/deformation_ratio`` and the
-    other ``BODY_METRICS``, as means over the trajectories whose ground truth has them. These metrics use only the frames before a rollout stops.
+    other ``BODY_METRICS``, and liquids the metrics of ``metrics.liquids``, as means over the trajectories whose truth has them. These metrics use only the
+    frames before a rollout stops.
 
     Put it before ``WarmAverage`` in the list of callbacks, so that it sees the averaged weights. Each rank takes some of the trajectories.
 
@@ -99,7 +101,7 @@ class RolloutValidation(Callback):
         simulator.eval()
         pairs = self._rollouts(simulator)
         simulator.train(was_training)
-        for name, value in {"rollout_mse": self._mse(pairs), **self._bodies(pairs)}.items():
+        for name, value in {"rollout_mse": self._mse(pairs), **self._shapes(pairs)}.items():
             pl_module.log(f"val/{name}", value, sync_dist=True)  # equal on all ranks; Lightning warns without sync_dist
 
     def _rollouts(self, simulator: LearnedSimulator) -> list[tuple[Trajectory, Trajectory]]:
@@ -126,15 +128,17 @@ class RolloutValidation(Callback):
         ]  # in the order of the trajectories
         return float(np.mean(everywhere))
 
-    def _bodies(self, pairs: list[tuple[Trajectory, Trajectory]]) -> dict[str, float]:
+    def _shapes(self, pairs: list[tuple[Trajectory, Trajectory]]) -> dict[str, float]:
         found: list[dict[str, float]] = []
         for prediction, truth in pairs:
             steps = int(np.isfinite(per_frame_mse(prediction, truth)[1:]).sum())
-            bodies = Bodies.of(truth)
+            bodies, liquid = Bodies.of(truth), liquid_nodes(truth)
             if bodies is not None and steps:
                 found.append(body_metrics(bodies.predicted(prediction.frames(0, steps + 1)), bodies, steps))
+            if liquid.any() and steps:
+                found.append(liquid_metrics(prediction.pos[steps, liquid], truth.pos[steps, liquid], truth.mass[liquid], truth.metadata))
         everywhere = [values for part in ranks.gathered(found) for values in part]
-        named = {name: [values[name] for values in everywhere if name in values] for name in BODY_METRICS}
+        named = {name: [values[name] for values in everywhere if name in values] for name in (*BODY_METRICS, *liquids.UNITS)}
         return {name: float(np.mean(values)) for name, values in named.items() if values}
 
 

@@ -8,13 +8,16 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import lightning as L
+import numpy as np
 import pytest
 
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics import liquids
 from gpe_pl.training import callbacks
 from gpe_pl.training.callbacks import BODY_METRICS, RolloutValidation
 from gpe_pl.trajectory.trajectory import Termination, Trajectory
 from tests.bodies import FRAMES, path
+from tests.sources import motion
 
 
 @pytest.fixture
@@ -50,3 +53,12 @@ def test_a_stopped_rollout_counts_with_its_good_frames(logged: Callable[..., dic
 def test_particles_have_no_bodies(logged: Callable[..., dict[str, float]]) -> None:
     particles = replace(path(), cells=None, rest_pos=None)
     assert logged([particles], [particles.frames(1)]) == {"val/rollout_mse": 0.0}
+
+
+def test_liquids_are_compared_in_validation(logged: Callable[..., dict[str, float]]) -> None:
+    pool = Trajectory.from_numpy(motion(num_frames=6), 0.01, "fluid", {"fluid": 1e-3}, spacing=0.1)
+    elsewhere = replace(pool, pos=pool.pos + np.where(np.arange(6) > 1, 0.3, 0.0)[:, None, None])
+    found = logged([pool], [elsewhere.frames(1)])
+    assert found.keys() == {"val/rollout_mse", *(f"val/{name}" for name in liquids.UNITS)}
+    assert found["val/centre_error"] == pytest.approx(0.3 * 2**0.5)
+    assert found["val/spacing_error"] == pytest.approx(0.0, abs=1e-6)
