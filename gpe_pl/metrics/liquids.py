@@ -41,7 +41,8 @@ def density(pos: Float[np.ndarray, "node dim"], metadata: Metadata) -> Float[np.
     pairs = cKDTree(points, boxsize=box).query_pairs(radius, output_type="ndarray")
     way = space.shortest(pos[pairs[:, 0]] - pos[pairs[:, 1]])
     weight = (1 - np.minimum(1.0, np.linalg.norm(way, axis=1) / radius)) ** 3
-    return 1.0 + sum(np.bincount(ends, weight, len(pos)) for ends in pairs.T)
+    here, there = (np.bincount(ends, weight, len(pos)) for ends in pairs.T)
+    return np.asarray(1.0 + here + there)
 
 
 def volume(pos: Float[np.ndarray, "node dim"], metadata: Metadata) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,13 @@ def falling(dim: int = 2, num_frames: int = 12) -> Trajectory:
     walls = Boundary.sample(domain_walls(bounds, 0.5), SPACING, dim)
     body = np.repeat([0, -1, 1], [16, 9, 16])
     kinds = ["solid" if b >= 0 else "sand" for b in body]
-    about = {"gravity": (0.0, -9.81, 0.0)[:dim], "bounds": bounds, "boundary": walls, "spacing": SPACING, "connectivity_radius": 0.117}
+    about: dict[str, Any] = {
+        "gravity": (0.0, -9.81, 0.0)[:dim],
+        "bounds": bounds,
+        "boundary": walls,
+        "spacing": SPACING,
+        "connectivity_radius": 0.117,
+    }
     return Trajectory.from_numpy(pos, DT, kinds, {"solid": 1e6, "sand": 30.0}, rigid_body=body, **about)
 
 
@@ -78,8 +85,8 @@ def test_the_step_has_the_momentum_of_the_predicted_accelerations() -> None:
     for rows in (slice(0, 16), slice(25, 41)):
         arm = start.pos[rows] - start.pos[rows].mean(dim=0)
         assert torch.allclose(rigid.vel[rows].sum(dim=0), free.vel[rows].sum(dim=0), rtol=1e-10)
-        spin = [(arm[:, 0] * s.vel[rows, 1] - arm[:, 1] * s.vel[rows, 0]).sum() for s in (rigid, free)]
-        assert torch.allclose(*spin, rtol=1e-9)
+        own, wanted = ((arm[:, 0] * s.vel[rows, 1] - arm[:, 1] * s.vel[rows, 0]).sum() for s in (rigid, free))
+        assert torch.allclose(own, wanted, rtol=1e-9)
         assert not torch.allclose(rigid.vel[rows], free.vel[rows], rtol=1e-3)
     assert torch.equal(rigid.vel[16:25], free.vel[16:25])
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from gpe_pl.data.importers.source import ImportFailure, ImportSettings, Item, Source
 from gpe_pl.schema import SPLITS
@@ -25,7 +26,7 @@ def arranged(source: Source, settings: ImportSettings) -> Source:
     every = [item for split in found for item in source.splits[split]]
     if settings.splits is not None and settings.leave_out is not None:
         raise ImportFailure("splits and leave_out: give only one of them")
-    wanted = {LEFT_OUT: [settings.leave_out]} if settings.leave_out is not None else settings.splits
+    wanted: Any = {LEFT_OUT: [settings.leave_out]} if settings.leave_out is not None else settings.splits
     if wanted is not None:
         return replace(source, splits=_listed(every, wanted, "leave_out" if settings.leave_out is not None else "splits"))
     if len(found) == 1 and found[0] != "train":
@@ -34,7 +35,7 @@ def arranged(source: Source, settings: ImportSettings) -> Source:
     return source
 
 
-def _listed(every: Sequence[Item], wanted: dict[str, list[int]], key: str) -> dict[str, list[Item]]:
+def _listed(every: Sequence[Item], wanted: Mapping[str, list[int]], key: str) -> dict[str, list[Item]]:
     """Return the trajectories of each split, given their numbers; see ``arranged``."""
     place: dict[int, str] = {}
     for split, numbers in wanted.items():

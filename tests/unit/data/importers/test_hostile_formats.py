@@ -92,15 +92,15 @@ def rollouts(tmp_path: Path) -> Path:
         (lambda f: (f / "4.h5").write_bytes(b"x"), "frame 4: 4.h5: not a readable HDF5 file"),
         (lambda f: set_arrays(f / "4.h5", shape_quats=np.zeros((2, 4))), "has shape_quats in 1 of 10 frames"),
         (
-            lambda f: [set_arrays(p, shape_quats=np.zeros((3, 4))) for p in f.iterdir()],
+            lambda f: in_all(f, shape_quats=np.zeros((3, 4))),
             "has shape_quats of 3 bodies and 0 scene_params, as none of FluidShake, RiceGrip and RigidFall",
         ),
         (
-            lambda f: [set_arrays(p, shape_quats=np.zeros((2, 4)), scene_params=np.zeros(6)) for p in f.iterdir()],
+            lambda f: in_all(f, shape_quats=np.zeros((2, 4)), scene_params=np.zeros(6)),
             "shape_quats has a quaternion of length 0",
         ),
         (
-            lambda f: [set_arrays(p, shape_quats=np.zeros((1, 4)), scene_params=np.array([1e300, 0])) for p in f.iterdir()],
+            lambda f: in_all(f, shape_quats=np.zeros((1, 4)), scene_params=np.array([1e300, 0])),
             "has 19 nodes, expected 64 for each of 0 cubes of scene_params",
         ),
         (lambda f: set_arrays(f / "4.h5", positions=np.zeros((7, 3), "f4")), r"frame 4: positions is \[7, 3\], expected \[20, 3\]"),
@@ -122,6 +122,12 @@ def set_arrays(path: Path, **arrays: np.ndarray) -> None:
             if name in file:
                 del file[name]
             file[name] = array
+
+
+def in_all(folder: Path, **arrays: np.ndarray) -> None:
+    """Put arrays into every file of a rollout."""
+    for path in folder.iterdir():
+        set_arrays(path, **arrays)
 
 
 # --- DeepLagrangianFluids and DMCF ---------------------------------------------------------------------------------------------------------
