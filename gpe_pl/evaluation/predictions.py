@@ -175,7 +175,7 @@ def start_of(simulator: LearnedSimulator | LearnedEnsemble, start_frame: int, tr
     across = size / (trajectory.num_frames * truth.metadata.frame_dt)  # the reference where everything rests
     speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
     guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, across), bounds=bounds, margin=size, spacing=truth.metadata.spacing)
-    if start_frame < simulator.builder.config.history:
+    if start_frame < members_of(simulator)[0].builder.config.history:
         initial = simulator.standing(trajectory.state(start_frame), trajectory.metadata)
     else:
         initial = simulator.initial_state(trajectory, start_frame)
