@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from gpe_pl.metrics.rollouts import rollout_metrics as rollout_metrics
     from gpe_pl.rollout.containment import Contained as Contained
     from gpe_pl.rollout.loop import rollout as roll_out  # noqa: F401
+    from gpe_pl.scenes.obstacles import Circle as Circle
+    from gpe_pl.scenes.scene import Scene as Scene
     from gpe_pl.trajectory.boundary import Boundary as Boundary
     from gpe_pl.trajectory.state import State as State
     from gpe_pl.trajectory.store import iter_trajectories as iter_trajectories
@@ -51,11 +53,13 @@ prepare()  # before Numba and Matplotlib are imported
 
 _MODULES = {
     "Boundary": "trajectory.boundary",
+    "Circle": "scenes.obstacles",
     "Contained": "rollout.containment",
     "GpeError": "errors",
     "LearnedEnsemble": "learned.ensemble",
     "LearnedSimulator": "learned.simulator",
     "Metadata": "trajectory.trajectory",
+    "Scene": "scenes.scene",
     "State": "trajectory.state",
     "Trajectory": "trajectory.trajectory",
     "dataset": "config.datasets",

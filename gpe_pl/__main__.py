@@ -13,6 +13,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "demo": ("scenes.demo", "show a shipped model beside its solver in the browser"),
     "play": ("scenes.play", "play with a model in the browser: drag, throw, slide its parameter"),
     "info": ("scenes.info", "print what a model was trained for, how accurate and how fast it is"),
+    "predict": ("scenes.predict", "roll a model out in a scene of your own"),
     "simulate": ("simulate", "generate a data set with a solver"),
     "fit": ("fit", "train a model, evaluate it and write a report"),
     "evaluate": ("evaluate", "compare rollouts of a trained model with the ground truth"),

@@ -120,12 +120,16 @@ def ground_of(points: np.ndarray, normals: np.ndarray, bounds: Bounds, spacing: 
     return DistanceGrid.from_values(low, spacing, values, friction)
 
 
+def turned(vectors: np.ndarray, up: Up) -> np.ndarray:
+    """Return vectors [vector, 3] of a file, whose axis ``up`` points up, with z up."""
+    return vectors @ np.asarray(_TO_Z_UP[up], float).T
+
+
 def _placed(
     path: Path, points: np.ndarray, normals: np.ndarray | None, bounds: Bounds, fit: Fit, up: Up, relief: float | None
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Move points [point, 3] and their normals into the frame of the scene; returns positions in m."""
-    turn = np.asarray(_TO_Z_UP[up], float).T
-    points, normals = points @ turn, None if normals is None else normals @ turn
+    points, normals = turned(points, up), None if normals is None else turned(normals, up)
     if fit == "none":
         return points, normals
     floor, room = np.array(bounds, float)[:, 0], np.ptp(np.array(bounds, float), axis=1)

@@ -459,7 +459,7 @@ def _body(count: int, spacing: float, material: str, dim: int, rng: np.random.Ge
     jitter = 0.0 if is_meshed else rng.uniform(-JITTER, JITTER, lattice.shape)
     points = lattice + jitter + rng.uniform(-0.5, 0.5, dim)
     kept = np.argsort(gauge(points), kind="stable")[:count]
-    cells = _lattice_cells(lattice[kept]) if is_meshed else np.empty((0, dim + 1), dtype=np.int64)
+    cells = lattice_cells(lattice[kept]) if is_meshed else np.empty((0, dim + 1), dtype=np.int64)
     return _Body(spacing * points[kept] @ _rotation(rng, dim).T, material, cells)
 
 
@@ -478,7 +478,7 @@ def _rotation(rng: np.random.Generator, dim: int) -> np.ndarray:
     )
 
 
-def _lattice_cells(sites: np.ndarray) -> np.ndarray:
+def lattice_cells(sites: np.ndarray) -> np.ndarray:
     """Return simplices [cell, dim + 1] of positive orientation that fill every lattice cell with all corners among the integer sites [point, dim].
 
     Each cell is cut along paths from its lowest to its highest corner, one simplex per order of the axes (Kuhn 1960), so that neighbours share faces.

@@ -1,0 +1,151 @@
+"""Bodies of a scene: regions of one material, which become nodes at the spacing of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.errors import GpeError
+from gpe_pl.geometry.meshing import MeshingError, triangulate
+from gpe_pl.geometry.shapes import Polygon
+from gpe_pl.solvers.scenes import JITTER, MESHED, lattice_cells
+from gpe_pl.solvers.solid_scenes import lumped_masses
+
+NUM_SIDES = 48
+"""Number of corners of the outline of a disc of a meshed solid."""
+MOST_NODES = 500_000
+"""Largest number of nodes of a body."""
+DARK = 0.5
+"""Brightness below which a pixel of an image belongs to the body, from 0 to 1."""
+
+
+class BodyFault(GpeError, ValueError):
+    """Raised for a body that has no nodes; the message says why."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A region of one material.
+
+    Attributes:
+        name: name in messages, such as ``block 1 (sand)``.
+        material: name of the material.
+        low, high: corners of its bounding box [dim] in m.
+        contains: tells which of points [point, dim] are inside.
+        outline: corners of its outline [corner, 2] in m, counter-clockwise, if it has one.
+        velocity: initial velocity [dim] in m/s.
+        parameters: given material parameters by name.
+        density: density [kg/m³]; None takes that of the training data.
+    """
+
+    name: str
+    material: str
+    low: np.ndarray
+    high: np.ndarray
+    contains: Callable[[np.ndarray], np.ndarray]
+    outline: np.ndarray | None
+    velocity: np.ndarray
+    parameters: Mapping[str, float]
+    density: float | None = None
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Nodes of a body: positions [node, dim] in m, masses [node] in kg, and nodes of mesh cells [cell, corner]."""
+
+    pos: np.ndarray
+    mass: np.ndarray
+    cells: np.ndarray
+
+
+def discretised(body: Body, spacing: float, density: float, rng: np.random.Generator) -> Nodes:
+    """Fill a body with nodes: solids with a mesh, elastomers with a regular lattice and its cells, other materials with a jittered lattice.
+
+    Raises:
+        BodyFault: the body is thinner than the spacing, has too many nodes, or its outline cannot be meshed.
+    """
+    dim = len(body.low)
+    if body.material == "solid":
+        return _meshed(body, spacing, density, rng)
+    count = np.floor((body.high - body.low) / spacing + 1e-6).astype(int)
+    if (count < 1).any():
+        raise BodyFault(f"{body.name}: is {min(body.high - body.low):g} m thin, less than the distance of nodes, {spacing:g} m")
+    if np.prod(count.astype(float)) > MOST_NODES:
+        raise BodyFault(
+            f"{body.name}: would have {np.prod(count.astype(float)):.3g} nodes {spacing:g} m apart, at most {MOST_NODES:,}; make it smaller"
+        )
+    sites = np.stack(np.meshgrid(*[np.arange(n) for n in count], indexing="ij"), axis=-1).reshape(-1, dim)
+    margin = (body.high - body.low - count * spacing) / 2
+    margin[-1] = 0.0  # the lowest nodes are half a spacing above the lowest side
+    centre = body.low + margin + spacing * (sites + 0.5)
+    inside = body.contains(centre)
+    if not inside.any():
+        raise BodyFault(f"{body.name}: has no node, as nodes are {spacing:g} m apart; make it larger")
+    is_meshed = body.material in MESHED
+    cells = lattice_cells(sites[inside]) if is_meshed else np.empty((0, dim + 1), dtype=np.int64)
+    pos = centre[inside] + (0.0 if is_meshed else spacing * rng.uniform(-JITTER, JITTER, (int(inside.sum()), dim)))
+    return Nodes(pos, np.full(len(pos), density * spacing**dim), cells)
+
+
+def _meshed(body: Body, spacing: float, density: float, rng: np.random.Generator) -> Nodes:
+    if body.outline is None:
+        raise BodyFault(f"{body.name}: solids need an outline in 2D; give a block, a ball or a polygon")
+    try:
+        pos, cells = triangulate([body.outline], spacing, rng)
+    except MeshingError as error:
+        raise BodyFault(f"{body.name}: {error}") from None
+    return Nodes(pos, lumped_masses(pos, cells, density), cells)
+
+
+def block(low: np.ndarray, high: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray | None]:
+    """Return region and outline of a box."""
+    corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]) if len(low) == 2 else None
+    return lambda x: np.all((x >= low) & (x <= high), axis=-1), corners
+
+
+def ball(center: np.ndarray, radius: float) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray | None]:
+    """Return region and outline of a disc or ball."""
+    angle = 2 * np.pi * np.arange(NUM_SIDES) / NUM_SIDES
+    outline = center + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1) if len(center) == 2 else None
+    return lambda x: np.linalg.norm(x - center, axis=-1) <= radius, outline
+
+
+def polygon(corners: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray]:
+    """Return region and outline of a simple polygon [corner, 2]; raises ``ValueError`` if it is none."""
+    x, y = corners[:, 0], corners[:, 1]
+    if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) < 0:
+        corners = corners[::-1]
+    shape = Polygon(tuple((float(a), float(b)) for a, b in corners), 0.0)
+    return lambda points: shape.signed_distance(points) <= 0, corners
+
+
+def image(path: Path, low: np.ndarray, high: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the region of the dark, opaque pixels of an image that is stretched over a rectangle.
+
+    Raises:
+        BodyFault: the file cannot be read, or has no dark pixel.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(path) as opened:
+            values = np.asarray(opened.convert("LA"), np.float64) / 255
+    except FileNotFoundError:
+        raise BodyFault(f"{path}: no such file (searched from {Path.cwd()})") from None
+    except Exception as error:  # of the reader, of any type
+        raise BodyFault(f"{path}: cannot be read as an image ({type(error).__name__})") from None
+    mask = (values[..., 0] < DARK) & (values[..., 1] > DARK)
+    if not mask.any():
+        raise BodyFault(f"{path}: has no dark pixels; draw the body black on white")
+    rows, columns = mask.shape
+
+    def contains(points: np.ndarray) -> np.ndarray:
+        place = (points - low) / (high - low)
+        column = np.clip((place[:, 0] * columns).astype(int), 0, columns - 1)
+        row = np.clip(((1 - place[:, 1]) * rows).astype(int), 0, rows - 1)
+        return np.all((place >= 0) & (place <= 1), axis=-1) & mask[row, column]
+
+    return contains

@@ -1,0 +1,247 @@
+"""Scenes of a few lines: what they become at the spacing of a model, and what is said of impossible ones."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gpe_pl.geometry.sections import section, solid_within
+from gpe_pl.geometry.shapes import Box
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.scenes import predict
+from gpe_pl.scenes.film import Film
+from gpe_pl.scenes.obstacles import Circle
+from gpe_pl.scenes.scene import Scene, SceneFault
+from gpe_pl.scenes.scene_file import read_scene
+from gpe_pl.schema import node_code
+
+ROOT = Path(__file__).parents[3]
+SPACING = 0.015625  # of the shipped model of sand
+
+
+@cache
+def model(name: str) -> LearnedSimulator:
+    return LearnedSimulator.from_checkpoint(name)
+
+
+def column(**properties: Any) -> Scene:
+    return Scene(box=(1.0, 1.0)).block("sand", at=(0.1, 0.0), size=(0.125, 0.25), **properties)
+
+
+def test_a_block_becomes_a_lattice_with_masses_and_parameters() -> None:
+    state, metadata = column(friction_angle=35, velocity=(1.0, 0.0)).ball("sand", at=(0.7, 0.6), radius=0.1).state(model("sand"))
+    first = state.pos[:, 0] < 0.5
+    assert first.sum() == 8 * 16
+    assert np.abs(state.pos[first].min(axis=0) - (0.1 + SPACING / 2, SPACING / 2)).max() <= SPACING / 4
+    assert np.unique(state.material_params[first]) == 35
+    assert np.unique(state.material_params[~first]) == pytest.approx(31.25)  # the middle of 20 to 42.5
+    assert np.unique(state.mass) == pytest.approx(1600 * SPACING**2)
+    assert (state.vel[first] == (1, 0)).all() and (state.vel[~first] == 0).all()
+    assert ((~first).sum() * SPACING**2) == pytest.approx(np.pi * 0.01, rel=0.1)
+    assert metadata.bounds == ((0.0, 1.0), (0.0, 1.0)) and metadata.gravity == (0.0, -9.81)
+    assert model("sand").untrained_scene(model("sand").standing(state, metadata)) == []
+
+
+@pytest.mark.parametrize(("name", "material"), [("elastomer", "elastomer"), ("fem", "solid")])
+def test_meshed_materials_get_cells(name: str, material: str) -> None:
+    state, metadata = Scene(box=(1.0, 1.0)).block(material, at=(0.3, 0.3), size=(0.25, 0.2)).state(model(name))
+    assert state.cells is not None and state.rest_pos is not None
+    corners = state.pos[state.cells]
+    area = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum()
+    assert area == pytest.approx(0.25 * 0.2 if material == "solid" else 15 * 11 * SPACING**2, rel=0.01)
+    model(name).standing(state, metadata)
+
+
+def test_liquid_fills_a_block_in_3d() -> None:
+    scene = Scene(box=(1.0, 1.0, 1.0)).block("fluid", at=(0.0, 0.0, 0.0), size=(0.3, 0.3, 0.2)).obstacle(Circle((0.7, 0.5, 0.2), 0.1))
+    state, _ = scene.state(model("fluid"))
+    assert state.num_nodes == 6 * 6 * 4
+    assert (state.node_type == node_code("fluid")).all()
+
+
+def test_an_image_is_a_body_where_it_is_dark(tmp_path: Path) -> None:
+    pixels = np.full((20, 40), 255, np.uint8)
+    pixels[:10, :20] = 0  # upper left
+    Image.fromarray(pixels).save(tmp_path / "body.png")
+    state, _ = Scene(box=(1.0, 1.0)).image("sand", tmp_path / "body.png", at=(0.2, 0.2), size=(0.4, 0.2)).state(model("sand"))
+    slack = SPACING
+    assert (state.pos >= np.array([0.2, 0.3]) - slack).all() and (state.pos <= np.array([0.4, 0.4]) + slack).all()
+    assert state.num_nodes * SPACING**2 == pytest.approx(0.2 * 0.1, rel=0.15)
+
+
+def test_a_polygon_is_a_body_in_either_direction() -> None:
+    corners = [(0.2, 0.2), (0.6, 0.2), (0.4, 0.6)]
+    counts = [Scene(box=(1.0, 1.0)).polygon("sand", order).state(model("sand"))[0].num_nodes for order in (corners, corners[::-1])]
+    assert counts[0] == counts[1]
+    assert counts[0] * SPACING**2 == pytest.approx(0.08, rel=0.05)
+
+
+def cube(path: Path) -> Path:
+    """Write a cube with a side of 2 from (10, 10, 10) on as ASCII STL."""
+    low, corners = np.full(3, 10.0), np.array([[x, y, z] for x in (0, 2) for y in (0, 2) for z in (0, 2)])
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    lines = ["solid cube"]
+    for a, b, c, d in faces:
+        for triangle in ((a, b, c), (a, c, d)):
+            vertices = "\n".join(f"vertex {x:g} {y:g} {z:g}" for x, y, z in low + corners[list(triangle)])
+            lines.append(f"facet normal 0 0 0\nouter loop\n{vertices}\nendloop\nendfacet")
+    path.write_text("\n".join([*lines, "endsolid cube"]))
+    return path
+
+
+def test_a_mesh_is_an_obstacle_by_its_section(tmp_path: Path) -> None:
+    pytest.importorskip("trimesh")
+    scene = column().obstacle(mesh=cube(tmp_path / "part.stl"), at=(0.5, 0.1), size=0.2)
+    shape = scene.state(model("sand"))[0].boundary.shapes[-1]
+    points = np.array([[0.6, 0.2], [0.6, 0.4], [0.45, 0.2], [0.52, 0.2]])
+    assert shape.signed_distance(points) == pytest.approx([-0.1, 0.1, 0.05, -0.02], abs=SPACING / 3)
+    with pytest.raises(SceneFault, match=r"obstacle 1: .*part.stl: reaches from 10 to 12, 10 to 12 m; .*; give at=… and size=… in m"):
+        column().obstacle(mesh=tmp_path / "part.stl").state(model("sand"))
+
+
+def test_a_section_of_a_tetrahedron_is_a_triangle() -> None:
+    a, b, c, d = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+    segments = section(np.array([[a, c, b], [a, b, d], [a, d, c], [b, c, d]]), 0.5)
+    assert {tuple(np.round(point, 6)) for segment in segments for point in segment} == {(0, 0), (0.5, 0), (0, 0.5)}
+    solid = solid_within(segments, ((-0.2, 1.0), (-0.2, 1.0)), 0.02, 0.4)
+    assert solid.signed_distance(np.array([[0.1, 0.1], [0.6, 0.6]])) == pytest.approx([-0.1, 0.35 * 2**0.5], abs=2e-3)
+
+
+FAULTS: list[tuple[Callable[[], Any], str]] = [
+    (lambda: Scene(box=(1.0,)), "box: must have 2 or 3 sides [m], or (low, high) for each axis, such as (1.5, 1.0), got (1.0,)"),
+    (lambda: Scene(box=(1.0, 1.0), gravity=(0, 0, -1)), "gravity: gravity=(0, 0, -1): must be 2 numbers"),
+    (lambda: Scene(box=(1.0, 1.0), friction=-1.0), "friction: must be a number of at least 0, or one for each of x_high, x_low"),
+    (lambda: Scene(box=(1.0, 1.0)).block("snad", (0, 0), (1, 1)), "block 1 (snad): unknown material; did you mean 'sand'?; known are sand"),
+    (lambda: column(friction_angel=30), "block 1 (sand): friction_angel: unknown key; did you mean 'friction_angle'?; sand has friction_angle, cohesion"),
+    (lambda: column(friction_angle=80), "block 1 (sand): friction_angle = 80.0 deg is outside 0 … 60, the solvers' limits"),
+    (lambda: column(friction_angle="steep"), "block 1 (sand): friction_angle='steep': must be a number"),
+    (lambda: column(velocity=1.0), "block 1 (sand): velocity=1.0: must be 2 numbers, one for each axis of the box"),
+    (lambda: Scene(box=(1.0, 1.0)).block("sand", at=(0, 0), size=(0, 1)), "block 1 (sand): size=0.0: must be a positive number"),
+    (lambda: Scene(box=(1.0, 1.0)).polygon("sand", [(0, 0), (1, 1), (1, 0), (0, 1)]), "polygon 1 (sand): corners: polygon edges"),
+    (lambda: column().obstacle(mesh="part.stl"), "obstacle 1: mesh=part.stl: no such file"),
+    (lambda: column().obstacle(), "obstacle 1: give either a shape, such as Circle"),
+    (lambda: column().obstacle("circle"), "obstacle 1: must be a shape, such as Circle((0.5, 0.2), 0.1), got 'circle'"),
+    (lambda: Scene(box=(1.0, 1.0)).predict("sand"), "the scene has no body; add one"),
+    (lambda: Scene(box=(1.0, 1.0)).predict(), "model: name one for the scene; shipped models"),
+    (lambda: column().predict("fem"), "block 1 (sand): the model is for solid"),
+    (lambda: column(cohesion=5.0).predict("sand"), "block 1 (sand): cohesion: the model was not trained with it, only with friction_angle"),
+    (lambda: column().predict("fluid"), "box: has 2 axes, the model is for 3D"),
+    (lambda: column().predict(seconds=-1.0), "seconds: must be more than 0 and at most 3600, got -1.0"),
+    (lambda: column().block("sand", (0.9, 0.5), (0.3, 0.1)).predict(), "block 2 (sand): at, size: reaches from 0.9 to 1.2 m along x, the box from 0 to 1 m"),
+    (lambda: column().block("sand", (0.5, 0.5), (0.01, 0.3)).predict(), "block 2 (sand): is 0.01 m thin, less than the distance of nodes, 0.015625 m"),
+    (lambda: column().block("sand", (0.15, 0.1), (0.3, 0.3)).predict(), "block 2 (sand): overlaps block 1 (sand); move one of the two"),
+    (lambda: column().obstacle(Circle((0.2, 0.1), 0.05)).predict(), "block 1 (sand): 27 of its 128 nodes are inside obstacle 1; move one of the two"),
+    (lambda: column().obstacle(Box((0.5, 0.0, 0.0), (0.6, 0.1, 0.1), 0.4)).predict(), "obstacle 1: Box"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "message"), FAULTS, ids=[message for _, message in FAULTS])
+def test_what_is_wrong_with_a_scene_is_named(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(SceneFault) as caught:
+        make()
+    assert str(caught.value).startswith(message)
+
+
+FILE = """
+box: [1.0, 1.0]
+friction: 0.3
+bodies:
+  - {block: sand, at: [0.1, 0.0], size: [0.125, 0.25], friction_angle: 35}
+obstacles:
+  - {circle: [0.7, 0.2], radius: 0.1}
+  - {box: [0.4, 0.0], high: [0.5, 0.1], friction: 0.2}
+"""
+
+
+def test_a_file_is_the_same_scene(tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(FILE)
+    read, _ = read_scene(tmp_path / "scene.yaml").state(model("sand"))
+    scene = Scene(box=(1.0, 1.0), friction=0.3).block("sand", at=(0.1, 0.0), size=(0.125, 0.25), friction_angle=35)
+    written, _ = scene.obstacle(Circle((0.7, 0.2), 0.1)).obstacle(Box((0.4, 0.0), (0.5, 0.1), 0.2)).state(model("sand"))
+    assert (read.pos == written.pos).all() and (read.material_params == written.material_params).all()
+    assert read.boundary.shapes == written.boundary.shapes
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("box: [1.0, 1.0]\n", "", "box: is missing; give the sides [m]"),
+        ("bodies:", "bodeis:", "bodeis: unknown key; did you mean 'bodies'?"),
+        ("size:", "sise:", "block 1 (sand): size: missing; sise: unknown key; did you mean 'size'?"),
+        ("block:", "blcok:", "bodies, part 1: needs one of the keys block, ball, polygon, image; did you mean 'block'?"),
+        ("radius: 0.1", "radios: 0.1", "obstacle 1: radios: unknown key; did you mean 'radius'?"),
+        ("radius: 0.1", "radius: wide", "obstacle 1: has a value of a wrong kind"),
+        ("box: [1.0, 1.0]", "box: [1.0, ", "is no YAML, at line"),
+        ("[0.1, 0.0]", "[0.1]", "block 1 (sand): at=[0.1]: must be 2 numbers"),
+    ],
+)
+def test_faults_of_a_file_are_named(tmp_path: Path, before: str, after: str, message: str) -> None:
+    (tmp_path / "scene.yaml").write_text(FILE.replace(before, after, 1))
+    with pytest.raises(SceneFault) as caught:
+        read_scene(tmp_path / "scene.yaml")
+    assert message in str(caught.value)
+
+
+def test_predict_writes_a_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gpe_pl.viz.browser.has_desktop", lambda: False)
+    Path("scene.yaml").write_text(FILE)
+    predict.run("scene.yaml", {"checkpoint": "sand", "seconds": 0.02})
+    lines = capsys.readouterr().out.splitlines()
+    assert "prediction: 0.02 s in 4 frames, 128 nodes" in lines and "scene.html" in lines
+    predict.run("scene.yaml", {"seconds": 0.02, "file": Path("film.svg")})
+    assert Path("film.svg").read_text().startswith("<?xml")
+
+
+def test_predict_draws_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("scene.yaml").write_text(FILE.replace("[0.7, 0.2]", "[0.2, 0.1]"))
+    with pytest.raises(SceneFault, match="inside obstacle 1; move one of the two; see scene_faults.png: faults are red"):
+        predict.run("scene.yaml", {})
+    red = np.asarray(Image.open("scene_faults.png").convert("RGB")).astype(int)
+    assert ((red[..., 0] > 180) & (red[..., 1] < 90) & (red[..., 2] < 90)).sum() > 500
+
+
+def test_examples_of_the_guide_are_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("trimesh")
+    monkeypatch.chdir(tmp_path)
+    cube(Path("part.stl"))
+    guide, readme = (ROOT / "docs" / "guide" / "scenes.md").read_text(), (ROOT / "README.md").read_text()
+    for text in (
+        *re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL),
+        predict.ABOUT[predict.ABOUT.index("  box:") :].replace("\n  ", "\n").strip(),
+    ):
+        Path("scene.yaml").write_text(text)
+        assert read_scene("scene.yaml").state(model("sand"))[0].num_nodes > 100
+    shown: list[Scene] = []
+
+    class Seen(Film):
+        def __init__(self, scene: Scene, *_: Any, **__: Any) -> None:
+            shown.append(scene)
+
+        def summary(self) -> str:
+            return ""
+
+        def show(self) -> Path:
+            return Path()
+
+    monkeypatch.setattr(Scene, "_film", lambda scene, *_, **__: Seen(scene))
+    for page in (guide, readme):
+        (code,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Scene(" in block)
+        exec(code, {})
+    assert [scene.state(model("sand"))[0].num_nodes > 100 for scene in shown] == [True, True]
+
+
+@pytest.mark.slow
+def test_a_model_stays_near_the_solver_in_a_scene_of_our_own() -> None:
+    film = column(friction_angle=30).obstacle(Circle((0.5, 0.05), 0.05)).compare("sand", seconds=0.2)
+    fall = 0.5 * 9.81 * 0.2**2
+    assert film.distance("sand") < 0.1 * fall
+    assert film.first.metadata.solver == "mpm" and film.first.num_frames == 41
