@@ -171,7 +171,7 @@ def one_step_nmse(
     metric = OneStepNMSE()
     with torch.inference_mode():
         for chosen in np.array_split(windows, -(-len(windows) // SCENES_AT_ONCE)):
-            batches = [batched([dataset[int(window)] for window in chosen]) for dataset in datasets]
+            batches = [batched([dataset[int(window)] for window in chosen]).to(members[0].acceleration_std.device) for dataset in datasets]
             predicted = [member(data).acceleration for member, data in zip(members, batches, strict=True)]
             unit = members[0].acceleration_std.float()
             for material in predicted[0]:
