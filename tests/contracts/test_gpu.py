@@ -12,6 +12,7 @@ from gpe_pl.config.datasets import dataset
 from gpe_pl.data.dataset import StartKey, StoredTrajectory, WindowDataset, collated
 from gpe_pl.data.ground_truth import generate_trajectory
 from gpe_pl.data.noise import Noise
+from gpe_pl.fit import fit
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -69,3 +70,9 @@ def test_rollouts_are_the_same(trajectory: Trajectory) -> None:
         found[device] = [state.pos.cpu() for state in steps(simulator, simulator.initial_state(trajectory, 8), 10)]
     for ours, theirs in zip(found["cpu"], found["cuda"], strict=True):
         torch.testing.assert_close(theirs, ours, rtol=0.0, atol=1e-4 * trajectory.metadata.spacing)
+
+
+def test_a_fit_trains_validates_and_evaluates(tmp_path: Path) -> None:
+    overrides = ("experiment=smoke", "trainer=gpu", "trainer.num_workers=0", "trainer.progress=false", "evaluation.num_pictures=0")
+    fit(compose("fit", *overrides, f"paths.data={tmp_path}/data", f"paths.runs={tmp_path}/runs"))
+    assert list(tmp_path.glob("runs/*/metrics.csv"))
