@@ -74,6 +74,11 @@ class TrainedValues:
         scenes = [scene_values(self.spec, "train", index) for index in range(self.spec.num_train)]
         return {m: np.unique([[*scene[m].values()] for scene in scenes], axis=0) for m in scenes[0]}
 
+    @property
+    def is_single(self) -> bool:
+        """Whether every material has a single trained vector. All choices between trained vectors are equal then."""
+        return all(len(vectors) == 1 for vectors in self._vectors.values())
+
     def nearest(self, own: Values) -> Values:
         """Return the trained vector of each material that is nearest to a scene's own."""
         return self._chosen({m: np.argmin(distance) for m, distance in self._distances(own).items()})

@@ -73,13 +73,18 @@ class MaterialControls:
         """Compute the missing solver runs.
 
         Raises:
-            ControlError: the data set has no scenes with unseen parameters, or they are too short.
+            ControlError: the data set has no scenes with unseen parameters, or they are too short, or its train split has a single value.
             GenerationError: the solver stopped.
         """
         if not self._indices or self.spec.num_frames <= (self.start_frame + 1) * self.stride:
             raise ControlError(
                 f"evaluation.material_controls=true: {self.spec.name} has {self.spec.num_test_unseen} trajectories of {self.spec.num_frames} frames in "
                 f"{UNSEEN}, rollouts start at frame {self.start_frame * self.stride}; choose data with more, or false"
+            )
+        if TrainedValues(self.trained).is_single:
+            raise ControlError(
+                f"evaluation.material_controls=true: all trajectories ({self.trained.num_train}) in the train split of {self.trained.name} have the same "
+                "material parameters, so there is nothing to compare; choose a larger data.num_train, or false"
             )
         self._runs.generate(self._indices, num_workers, on_progress)
 

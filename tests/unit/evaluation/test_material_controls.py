@@ -115,3 +115,8 @@ def test_data_without_unseen_scenes_are_refused(controls: MaterialControls) -> N
     for spec in (replace(controls.spec, num_test_unseen=0), replace(controls.spec, num_frames=3)):
         with pytest.raises(ControlError, match="evaluation.material_controls=true: sand has . trajectories of .* frames in test_unseen"):
             replace(controls, spec=spec).prepare()
+
+
+def test_a_single_trained_value_is_refused(controls: MaterialControls) -> None:
+    with pytest.raises(ControlError, match=r"all trajectories \(1\) in the train split of sand have the same material parameters"):
+        replace(controls, trained=replace(controls.trained, num_train=1)).prepare()
