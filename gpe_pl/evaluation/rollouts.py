@@ -97,7 +97,12 @@ def evaluate(
     frame_dt = first.builder.metadata.frame_dt
     start_frame = settings.first_frame(first.builder.config.history, frame_dt)
     check_formats(settings.export, simulator)
-    simulator = configured(simulator, clamps_parameters=settings.clamp_parameters, static_friction=settings.static_friction)
+    simulator = configured(
+        simulator,
+        clamps_parameters=settings.clamp_parameters,
+        static_friction=settings.static_friction,
+        mirror_average=settings.mirror_average,
+    )
     run_dir.mkdir(parents=True, exist_ok=True)
     predictor = Predictor(simulator, settings, label, controls, stride, start_frame, seconds=[])
     rows, films = list[Row](), list[Film]()

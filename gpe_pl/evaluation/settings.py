@@ -32,6 +32,7 @@ class EvaluationSettings:
         clamp_parameters: clamp material parameters outside the trained range to the nearest trained value.
         static_friction: nodes that walls support stay in place if they are slower than this fraction of the speed that gravity gives in one frame (see
             ``nn.static_friction``); None takes the model's own value.
+        mirror_average: average each step over the scene and its mirror images (see ``learned.mirror_average``); None takes the model's own value.
         material_controls: roll scenes with unseen parameters out with other parameters, too (see ``material_controls``).
         num_pictures: number of trajectories per split that get a figure, an animation and a viewer. With 0, no curve of errors is drawn, either.
         export: what to write for other programs: the trajectories with pictures as ``vtk`` series, ``npz`` and ``mp4``, the ``model`` (see
@@ -46,6 +47,7 @@ class EvaluationSettings:
     num_uncontained: Annotated[int, Field(ge=0)] | None = None
     clamp_parameters: bool = True
     static_friction: Annotated[float, Field(ge=0, lt=1)] | None = None
+    mirror_average: bool | None = None
     material_controls: bool = False
     num_pictures: Annotated[int, Field(ge=0)] = 2
     export: list[Export] = field(default_factory=list)

@@ -26,6 +26,7 @@ import torch
 from torch import Tensor, nn
 from torch.export import Dim
 
+from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.graphs.features import history_of
 from gpe_pl.graphs.topology import IslandTopology, MeshTopology, Topology, descent_of
@@ -246,14 +247,23 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
     return {name: scene[name] for name in describe(simulator)}
 
 
+class MirrorAverageError(GpeError, ValueError):
+    """Raised for a simulator that averages over mirror images, which an exported program does not."""
+
+
 def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
     """Write a simulator's step as a ``torch.export`` program to ``path``, which ends in ``.pt2``. The file appears complete or not at all.
 
     Raises:
         ValueError: ``path`` has another file type.
         CellError: the model needs the cells of meshes, which a program does not take.
+        MirrorAverageError: the simulator averages over mirror images, which a program does not.
     """
     path = Path(path)
+    if simulator.mirror_average:
+        raise MirrorAverageError(
+            "exported programs do not average over mirror images; choose evaluation.mirror_average=false to export the model without"
+        )
     if simulator.builder.spec.cells:
         raise CellError("exported programs have no cells; export a model with model.elastic=false graph.cells=false")
     if path.suffix != ".pt2":

@@ -17,7 +17,7 @@ from gpe_pl.graphs.islands import islands_within
 from gpe_pl.graphs.neighbors import radius_between
 from gpe_pl.graphs.search import walls_of
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
+from gpe_pl.rollout.loop import SimulationError, Simulator, sound, step_all
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.boundary import search_tree
 from gpe_pl.trajectory.cells import cell_edges, mean_over_corners
@@ -41,10 +41,7 @@ class Batched(ABC):
         """Return the states one frame later. A scene that cannot be advanced has its error instead."""
 
     def step(self, state: State) -> State:
-        (after,) = self.step_all([state])
-        if isinstance(after, SimulationError):
-            raise after
-        return after
+        return sound(*self.step_all([state]))
 
 
 @dataclass(frozen=True)

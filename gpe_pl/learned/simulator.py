@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -34,15 +34,17 @@ from gpe_pl.graphs.topology import Topology
 from gpe_pl.learned import next_states
 from gpe_pl.learned.checkpoint_file import CheckpointError as CheckpointError
 from gpe_pl.learned.checkpoint_file import load_checkpoint, reason
+from gpe_pl.learned.mirror_average import MirrorAverage
 from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.pretrained import checkpoint_path
-from gpe_pl.learned.training_ranges import outside_masses, outside_parameters, stored_ranges
+from gpe_pl.learned.rollout_settings import RolloutSettings
+from gpe_pl.learned.training_ranges import named_materials, outside_masses, outside_parameters, stored_ranges
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
 from gpe_pl.nn.static_friction import keeps_position, supported
-from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.rollout.loop import SimulationError, sound
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.schema import BOUNDARY, EdgeType, node_code, param_names
+from gpe_pl.schema import BOUNDARY, EdgeType, node_code
 from gpe_pl.system.signatures import check_plain, checked
 from gpe_pl.trajectory.rigid_bodies import all_of_bodies
 from gpe_pl.trajectory.scene_ranges import described, outside, scene_range, united, unlimited
@@ -71,10 +73,11 @@ class LearnedSimulator(nn.Module):
         clamps_parameters: clamp material parameters outside the range of training to the nearest trained value. A network is less reliable outside this range.
         static_friction: fraction of the speed that gravity gives in one frame. Nodes on a wall that are slower keep their positions (see
             ``nn.static_friction``). 0 switches this off.
+        mirror_average: average each step of a rollout over the scene and its mirror images (see ``mirror_average``).
         acceleration_std, stress_std: units of the model's accelerations [m/s²] and stresses [Pa].
         trained_scene, trained_mass: ranges in training, as in ``scene_ranges`` and ``training_ranges.outside_masses``.
 
-    You may change the first three attributes at any time. Of them, ``save`` stores only ``static_friction``.
+    You may change the first four attributes at any time. Of them, ``save`` stores ``static_friction`` and ``mirror_average``.
     """
 
     model: Model
@@ -83,11 +86,12 @@ class LearnedSimulator(nn.Module):
     trained_scene: Tensor
     trained_mass: Tensor
     clamps_parameters: bool = True
+    mirror_average: bool = False
 
     def __init__(self, model: Model, builder: GraphBuilder, stride: int = 1) -> None:
         super().__init__()
         self.model, self.builder, self.stride = model, builder, stride
-        self._static_friction = 0.0
+        self._static_friction, self._averaged = 0.0, MirrorAverage(builder.metadata.bounds)
         self._warned: set[str] = set()
         self._unknown: list[str | EdgeType] | None = None  # None: not determined yet
         self.standardizer = GraphStandardizer(builder.spec, builder.config.parameter_scale)
@@ -116,18 +120,13 @@ class LearnedSimulator(nn.Module):
         self.builder = replace(self.builder, skips=skips)
         self.model.skips = skips
 
-    def configured(
-        self, *, skips: Skips | None = None, clamps_parameters: bool | None = None, static_friction: float | None = None
-    ) -> LearnedSimulator:
+    def configured(self, **settings: Unpack[RolloutSettings]) -> LearnedSimulator:
         """Return a copy with other settings; None keeps a setting. The copy shares the weights and leaves this simulator unchanged."""
         other = copy.copy(self)
         other._modules = {**self._modules, "model": copy.copy(self.model)}
-        if skips is not None:
-            other.skips = skips
-        if clamps_parameters is not None:
-            other.clamps_parameters = clamps_parameters
-        if static_friction is not None:
-            other.static_friction = static_friction
+        for name, value in settings.items():
+            if value is not None:
+                setattr(other, name, value)
         return other
 
     @property
@@ -330,9 +329,9 @@ class LearnedSimulator(nn.Module):
                 choice = choice or f"every frame number {stride}: Trajectory.every({stride}), or data.stride={stride}"
             strided = f" (data.stride={self.stride})" if self.stride > 1 else ""
             raise SceneError(
-                f"the model was trained with frame_dt={own.frame_dt:g} s{strided} and spacing={own.spacing:g} m in {own.dim}D on {_materials(own)}; "
+                f"the model was trained with frame_dt={own.frame_dt:g} s{strided} and spacing={own.spacing:g} m in {own.dim}D on {named_materials(own)}; "
                 f"the scene has frame_dt={scene.frame_dt:g} s and spacing={scene.spacing:g} m in {scene.dim}D and "
-                f"{_materials(scene)}; choose the data set with {choice or 'data=… size=…'}"
+                f"{named_materials(scene)}; choose the data set with {choice or 'data=… size=…'}"
             )
 
     def stride_on(self, stored: Metadata) -> int:
@@ -373,24 +372,26 @@ class LearnedSimulator(nn.Module):
 
     @torch.inference_mode()
     def step(self, state: State) -> State:
+        if self.mirror_average:
+            return sound(*self.step_all([state]))
         standards = self._standards([state])
         return self._advance_all([state], [self.builder.topology(state)], standards)[0]
 
     @torch.inference_mode()
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
         """Advance several scenes by one pass of the model. A scene whose graph cannot be built has its error instead of a state."""
-        return self.next_states(states)
+        return self._averaged.next_states(self.next_states, states) if self.mirror_average else self.next_states(states)
 
     def next_states(self, states: list[State]) -> list[State | SimulationError]:
-        """Do the same as ``step_all`` outside inference mode, so that autograd can use the results in training.
+        """Do the same as ``step_all`` outside inference mode, so that autograd can use the results in training, and without ``mirror_average``.
 
         States may be on the host while the model is on another device.
         """
         new: list[Any] = [self.builder.topology_or_error(state) for state in states]
-        sound = [k for k, topology in enumerate(new) if not isinstance(topology, SimulationError)]
-        if sound:
-            kept = [states[k] for k in sound]
-            for k, state in zip(sound, self._advance_all(kept, [new[k] for k in sound], self._standards(kept)), strict=True):
+        kept = [k for k, topology in enumerate(new) if not isinstance(topology, SimulationError)]
+        if kept:
+            chosen = [states[k] for k in kept]
+            for k, state in zip(kept, self._advance_all(chosen, [new[k] for k in kept], self._standards(chosen)), strict=True):
                 new[k] = state
         return new
 
@@ -528,6 +529,7 @@ class LearnedSimulator(nn.Module):
             "graph": asdict(self.builder.config),
             "metadata": asdict(self.builder.metadata),
             "static_friction": self.static_friction,
+            "mirror_average": self.mirror_average,
             "stride": self.stride,
         }
 
@@ -549,6 +551,9 @@ class LearnedSimulator(nn.Module):
             raise ValueError(f"stride {stride!r} is no integer of at least 1")
         simulator = cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder, stride)
         simulator.static_friction = values.get("static_friction", 0.0)
+        if type(average := values.get("mirror_average", False)) is not bool:
+            raise ValueError(f"mirror_average={average!r}: must be true or false")
+        simulator.mirror_average = average
         return simulator
 
     def save(self, path: Path | str) -> None:
@@ -586,9 +591,3 @@ class LearnedSimulator(nn.Module):
                 f"{path}: not a checkpoint of gpe_pl or one of another model ({reason(error)}); take another one of the run, such as last.ckpt"
             ) from None
         return simulator.to(device).eval()
-
-
-def _materials(metadata: Metadata) -> str:
-    """Return the materials, and the parameters that the data set stores besides the first of each."""
-    further = set(metadata.param_names) - set(param_names(metadata.materials))
-    return ", ".join(metadata.materials) + (f" with {', '.join(sorted(further))}" if further else "")

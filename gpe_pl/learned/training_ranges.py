@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from torch import Tensor
 
-from gpe_pl.schema import MaterialParameter, node_code
+from gpe_pl.schema import MaterialParameter, node_code, param_names
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata
 
@@ -59,3 +59,9 @@ def outside_masses(state: State, materials: Sequence[str], trained: Tensor) -> I
         if bool(is_outside.any()):
             kind = f"mass of nodes of {material}"
             yield kind, f"{kind} is {mass[is_outside][0].item():g} kg, in training it was {low:g} to {high:g} kg"
+
+
+def named_materials(metadata: Metadata) -> str:
+    """Return the materials, and the parameters that the data set stores besides the first of each."""
+    further = set(metadata.param_names) - set(param_names(metadata.materials))
+    return ", ".join(metadata.materials) + (f" with {', '.join(sorted(further))}" if further else "")

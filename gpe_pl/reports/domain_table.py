@@ -66,7 +66,14 @@ PAPER_COLUMN = "paper"
 TRIVIAL_SHOWN = ("ballistic", "stops_at_walls")
 """Trivial baselines with a column in the table and a line in the figure, if they were evaluated."""
 
-SAME_IN_A_ROW = ("data.", "evaluation.data.", "evaluation.containment", "evaluation.clamp_parameters", "evaluation.static_friction")
+SAME_IN_A_ROW = (
+    "data.",
+    "evaluation.data.",
+    "evaluation.containment",
+    "evaluation.clamp_parameters",
+    "evaluation.static_friction",
+    "evaluation.mirror_average",
+)
 """Prefixes of the configuration keys that must be equal for all models of a domain."""
 
 

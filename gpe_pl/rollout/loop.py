@@ -77,6 +77,13 @@ class Replay:
         return self.trajectory.state(frame)
 
 
+def sound(after: State | SimulationError) -> State:
+    """Return a state that ``step_all`` returned for a scene, or raise the error that it returned instead."""
+    if isinstance(after, SimulationError):
+        raise after
+    return after
+
+
 def step_all(simulator: Simulator, states: list[State]) -> list[State | SimulationError]:
     """Return the next state of every scene, computed together if the simulator can. Errors of single scenes are returned, so that the others continue."""
     if not states:

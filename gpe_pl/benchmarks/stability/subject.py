@@ -179,7 +179,7 @@ def in_double(simulator: LearnedSimulator) -> LearnedSimulator:
     """Return the simulator with the same weights in double precision, as a reference for rounding errors."""
     twin = _DoubleSimulator(copy.deepcopy(simulator.model), _DoubleBuilder(simulator.builder.config, simulator.builder.metadata))
     twin.load_state_dict(simulator.state_dict())
-    twin.static_friction = simulator.static_friction
+    twin.static_friction, twin.mirror_average = simulator.static_friction, simulator.mirror_average
     return twin.double().eval()
 
 

@@ -1,0 +1,94 @@
+"""Averages the step of a simulator over a scene and its mirror images, so that left and right are treated alike.
+
+A network does not learn mirror symmetry exactly: a symmetric body that falls flat begins to turn. The mean over the group of reflections is exactly symmetric
+(group averaging), and its error is smaller, because errors of the images differ. It costs a pass of the model per image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Any
+
+import torch
+
+from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.reflection import Reflection
+from gpe_pl.trajectory.state import State, Stress
+
+MAX_BOUNDARIES = 64
+"""Number of boundaries whose images are kept."""
+
+
+@dataclass
+class MirrorAverage:
+    """Makes averaged steps.
+
+    Attributes:
+        bounds: ``(low, high)`` of the domain per axis [m]. The images are mirrored at its middle.
+    """
+
+    bounds: Sequence[tuple[float, float]]
+    _images: dict[int, tuple[Boundary, list[Boundary]]] = field(default_factory=dict, repr=False)
+
+    def next_states(
+        self, next_states: Callable[[list[State]], list[State | SimulationError]], states: list[State]
+    ) -> list[State | SimulationError]:
+        """Return the states one frame later. A scene whose graph, or that of an image, cannot be built has its error instead.
+
+        Args:
+            next_states: makes the steps of several scenes without averaging, and has no memory between steps.
+            states: states of the scenes.
+        """
+        reflections = [self._reflections(state) for state in states]
+        images = [
+            reflection.state(state, boundary)
+            for state, own in zip(states, reflections, strict=True)
+            for reflection, boundary in zip(own, self._boundaries(state.boundary, own), strict=True)
+        ]
+        plain = next_states([*states, *images])
+        mirrored = iter(plain[len(states) :])
+        return [
+            self._mean(state, [(reflection, next(mirrored)) for reflection in own])
+            for state, own in zip(plain[: len(states)], reflections, strict=True)
+        ]
+
+    def _reflections(self, state: State) -> list[Reflection]:
+        """Return the reflections along the axes without gravity, and their products."""
+        bounds = state.periodicity.bounds if state.periodicity else self.bounds
+        level = [axis for axis in range(state.dim) if float(state.gravity[axis]) == 0]
+        chosen = [[axis for axis, turns in zip(level, which, strict=True) if turns] for which in product((False, True), repeat=len(level))]
+        return [Reflection.of(bounds, axes) for axes in chosen[1:]]
+
+    def _boundaries(self, boundary: Boundary, reflections: list[Reflection]) -> list[Boundary]:
+        """Return the images of a boundary; those of a boundary at rest are made once, and so are their search trees."""
+        known = self._images.get(id(boundary))
+        if known is None or known[0] is not boundary:
+            if len(self._images) >= MAX_BOUNDARIES:
+                self._images.clear()
+            known = self._images[id(boundary)] = boundary, [reflection.boundary(boundary) for reflection in reflections]
+        return known[1]
+
+    def _mean(self, state: State | SimulationError, images: list[tuple[Reflection, Any]]) -> State | SimulationError:
+        if isinstance(state, SimulationError) or not images:
+            return state
+        if error := next((image for _, image in images if isinstance(image, SimulationError)), None):
+            return error
+        back = [reflection.state(image, state.boundary) for reflection, image in images]
+        changes = [state.periodicity.shortest(other.pos - state.pos) for other in back]
+        stress = [s.stress for s in (state, *back) if s.stress is not None]
+        return replace(
+            state,
+            pos=state.pos + sum(changes) / (1 + len(back)),
+            vel=_mean([s.vel for s in (state, *back)]),
+            velocity_history=_mean([s.velocity_history for s in (state, *back)]),
+            frame_velocity=_mean([s.frame_velocity for s in (state, *back)]),
+            stress=Stress(_mean([s.node for s in stress]), _mean([s.cell for s in stress])) if stress else None,
+        )
+
+
+def _mean(values: Sequence[Any]) -> Any:
+    """Return the mean of tensors; None if there are none."""
+    return None if values[0] is None else torch.stack([*values]).mean(dim=0)

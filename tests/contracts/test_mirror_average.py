@@ -1,0 +1,117 @@
+"""Averaging over mirror images makes rollouts mirror-symmetric, and is the plain mean of the steps of the images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from gpe_pl.config.datasets import dataset
+from gpe_pl.data.ground_truth import generate_trajectory
+from gpe_pl.evaluation.mirror_check import mirror_equivariance_error
+from gpe_pl.export.program import MirrorAverageError, export_model
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned.checkpoint_file import CheckpointError
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.rollout.loop import SimulationError, steps
+from gpe_pl.rollout.mirrored import Mirrored
+from gpe_pl.trajectory.trajectory import Trajectory
+from tests.runs import compose
+
+START, STEPS = 6, 8
+
+
+@pytest.fixture(scope="module", params=["sand", "fluid", "fem"])
+def scene(request: pytest.FixtureRequest) -> tuple[LearnedSimulator, Trajectory]:
+    overrides = (f"data={request.param}", "size=tiny")
+    trajectory = generate_trajectory(dataset(*overrides), "train", 0, num_frames=START + STEPS + 1)
+    cfg = compose("fit", "model=gpe_tuned", *overrides)
+    builder = GraphBuilder(GraphConfig(**cfg.graph), trajectory.metadata)
+    torch.manual_seed(0)
+    model = GPE(builder.spec, **{key: value for key, value in cfg.model.items() if key != "_target_"})
+    for parameter in model.parameters():
+        if not parameter.any():  # decoders begin at zero
+            torch.nn.init.normal_(parameter, std=0.02)
+    return LearnedSimulator(model, builder).eval(), trajectory
+
+
+def averaged(learned: LearnedSimulator) -> LearnedSimulator:
+    return learned.configured(mirror_average=True)
+
+
+def test_mirror_images_move_alike(scene: tuple[LearnedSimulator, Trajectory]) -> None:
+    learned, trajectory = scene
+    plain, mean = (mirror_equivariance_error(s, trajectory, START) for s in (learned, averaged(learned)))
+    assert mean <= 1e-3 * plain  # solids in free flight have no error at all
+
+
+def test_a_step_is_the_mean_of_the_steps_of_all_images(scene: tuple[LearnedSimulator, Trajectory]) -> None:
+    learned, trajectory = scene
+    metadata = trajectory.metadata
+    state = learned.initial_state(trajectory, START)
+    middle = [sum(bounds) / 2 for bounds in metadata.bounds]
+    images = [learned, Mirrored(learned, 0, middle[0])]
+    if metadata.dim == 3:
+        images += [Mirrored(image, 1, middle[1]) for image in images]
+    after = [image.step(state) for image in images]
+    mean = averaged(learned).step(state)
+    for name in ("pos", "vel", "velocity_history", "frame_velocity"):
+        values = [getattr(s, name) for s in after]
+        if values[0] is None:
+            assert getattr(mean, name) is None
+        else:
+            torch.testing.assert_close(getattr(mean, name), torch.stack(values).mean(dim=0), rtol=1e-6, atol=1e-6 * metadata.spacing)
+    if after[0].stress is not None:
+        expected = torch.stack([s.stress.cell for s in after]).mean(dim=0)
+        torch.testing.assert_close(mean.stress.cell, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
+
+
+def test_scenes_together_move_as_alone(scene: tuple[LearnedSimulator, Trajectory]) -> None:
+    learned, trajectory = scene
+    mean = averaged(learned)
+    first, second = (mean.initial_state(trajectory, frame) for frame in (START, START + 2))
+    together = mean.step_all([first, second])
+    for alone, state in zip((mean.step(first), mean.step(second)), together, strict=True):
+        assert not isinstance(state, SimulationError)
+        torch.testing.assert_close(state.pos, alone.pos, rtol=0.0, atol=1e-6 * trajectory.metadata.spacing)
+
+
+def test_gravity_along_every_axis_leaves_nothing_to_average(scene: tuple[LearnedSimulator, Trajectory]) -> None:
+    learned, trajectory = scene
+    state = learned.initial_state(trajectory, START)
+    tilted = replace(state, gravity=torch.full_like(state.gravity, -1.0))
+    assert torch.equal(averaged(learned).step(tilted).pos, learned.step(tilted).pos)
+
+
+def test_checkpoints_store_it(scene: tuple[LearnedSimulator, Trajectory], tmp_path: Path) -> None:
+    learned = scene[0]
+    averaged(learned).save(tmp_path / "model.ckpt")
+    assert LearnedSimulator.from_checkpoint(tmp_path / "model.ckpt").mirror_average
+    checkpoint = torch.load(tmp_path / "model.ckpt", weights_only=True)
+    checkpoint["simulator"]["mirror_average"] = 2
+    torch.save(checkpoint, tmp_path / "bad.ckpt")
+    with pytest.raises(CheckpointError, match="mirror_average=2: must be true or false"):
+        LearnedSimulator.from_checkpoint(tmp_path / "bad.ckpt")
+    del checkpoint["simulator"]["mirror_average"]  # as before it existed
+    torch.save(checkpoint, tmp_path / "old.ckpt")
+    assert not LearnedSimulator.from_checkpoint(tmp_path / "old.ckpt").mirror_average
+
+
+def test_programs_refuse_it(scene: tuple[LearnedSimulator, Trajectory], tmp_path: Path) -> None:
+    with pytest.raises(MirrorAverageError, match="evaluation.mirror_average=false"):
+        export_model(averaged(scene[0]), tmp_path / "model.pt2")
+
+
+def test_the_boundary_may_change_between_steps(scene: tuple[LearnedSimulator, Trajectory]) -> None:
+    learned, trajectory = scene
+    mean = averaged(learned)
+    state = mean.initial_state(trajectory, START)
+    without = replace(state, boundary=replace(state.boundary, pos=state.boundary.pos + 100.0, shapes=()))
+    for begin in (state, without, state):
+        *_, once = steps(mean, begin, 2)
+        *_, again = steps(averaged(learned), begin, 2)
+        assert torch.equal(once.pos, again.pos)
