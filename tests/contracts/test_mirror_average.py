@@ -19,7 +19,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.checkpoint_file import CheckpointError
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.rollout.loop import SimulationError, steps
+from gpe_pl.rollout.loop import SimulationError, Simulator, steps
 from gpe_pl.rollout.mirrored import Mirrored
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests.runs import compose
@@ -60,7 +60,7 @@ def test_a_step_is_the_mean_of_the_steps_of_all_images(scene: tuple[LearnedSimul
     metadata = trajectory.metadata
     state = learned.initial_state(trajectory, START)
     middle = [sum(bounds) / 2 for bounds in metadata.bounds]
-    images = [learned, Mirrored(learned, 0, middle[0])]
+    images: list[Simulator] = [learned, Mirrored(learned, 0, middle[0])]
     if metadata.dim == 3:
         images += [Mirrored(image, 1, middle[1]) for image in images]
     after = [image.step(state) for image in images]
@@ -71,8 +71,8 @@ def test_a_step_is_the_mean_of_the_steps_of_all_images(scene: tuple[LearnedSimul
             assert getattr(mean, name) is None
         else:
             torch.testing.assert_close(getattr(mean, name), torch.stack(values).mean(dim=0), rtol=1e-6, atol=1e-6 * metadata.spacing)
-    if after[0].stress is not None:
-        expected = torch.stack([s.stress.cell for s in after]).mean(dim=0)
+    if mean.stress is not None:
+        expected = torch.stack([s.stress.cell for s in after if s.stress is not None]).mean(dim=0)
         torch.testing.assert_close(mean.stress.cell, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
 
 
