@@ -36,6 +36,7 @@ from gpe_pl.reports.finished_runs import (
     with_groups,
 )
 from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, verdict, write_material_figure
+from gpe_pl.reports.outcome import outcomes
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
 from gpe_pl.reports.stride_table import STRIDES_MD, stride_lines
 from gpe_pl.rollout.baselines import BASELINES
@@ -141,11 +142,15 @@ def report_evaluation(folder: Path) -> None:
 
 
 def conclusion(folder: Path) -> str:
-    """Return the text that a command prints at its end: metrics of the run or evaluation in a folder, whether the model reads the material, and viewers."""
+    """Return the text that a command prints at its end: metrics of the run or evaluation in a folder, viewers, and what follows from them.
+
+    The last lines are ``outcome.outcomes``, and whether the model reads the material.
+    """
     viewers = sorted(folder.glob("rollout_*_00.html"))
     rows = table_of(read_rows(folder / "metrics.csv"))
-    reads = [line for line in [verdict([Run(folder, {}, rows)])] if line]
-    return "\n".join([summary(rows), *reads, *(printable(f"look at {viewer}") for viewer in viewers)])
+    run = Run(folder, {}, rows)
+    said = [*outcomes(run), *filter(None, [verdict([run])])]
+    return "\n".join([summary(rows), *(printable(f"look at {viewer}") for viewer in viewers), *said])
 
 
 def summary(rows: pd.DataFrame) -> str:

@@ -1,0 +1,55 @@
+"""The outcome of an evaluation in one line per split: how far a model is below free flight, how many rollouts failed, and what else is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from gpe_pl.evaluation.metric_rows import LEARNED
+from gpe_pl.reports.finished_runs import Run, rollout_errors, splits_of, values_by_seed
+
+FREE_FLIGHT = "ballistic"
+"""Baseline in which every node falls freely until it touches a wall."""
+REMARKS = {
+    "fraction_corrected": (0.01, "containment corrected {:.2g} % of the particle-steps"),
+    "fraction_outside_at_end": (0.0, "{:.2g} % of the nodes end in walls"),
+}
+"""Fractions that are mentioned above a limit, with the words for their percentage."""
+
+
+def outcomes(run: Run) -> Iterator[str]:
+    """Yield one line per split that has rollouts of the model and of free flight over the whole horizon."""
+    for split in splits_of(run):
+        exact = values_by_seed([run], LEARNED, split, "rollout_mse", "full")
+        flight = values_by_seed([run], FREE_FLIGHT, split, "rollout_mse", "full")
+        if not (exact and flight and exact[0] and flight[0]):
+            continue
+        (errors,) = rollout_errors([run], split, "full")
+        shared = sorted(errors.keys() & flight[0].keys())
+        own, trivial = (sum(values[k] for k in shared) / max(1, len(shared)) for values in (errors, flight[0]))
+        failed = sum(not math.isfinite(value) for value in exact[0].values())
+        yield "; ".join(
+            [
+                f"{split}: full-horizon error {_compared(own, trivial)}",
+                f"{failed} of {len(exact[0])} rollouts failed",
+                *_remarks(run, split),
+            ]
+        )
+
+
+def _compared(own: float, trivial: float) -> str:
+    if not (own > 0 and trivial > 0 and math.isfinite(own / trivial)):
+        return f"{own:.3g} m², free flight {trivial:.3g} m²"
+    ratio = trivial / own
+    return (
+        f"{ratio:.3g} times below free flight" if ratio >= 1 else f"{1 / ratio:.3g} times ABOVE free flight, so the model is of no use here"
+    )
+
+
+def _remarks(run: Run, split: str) -> Iterator[str]:
+    for metric, (limit, words) in REMARKS.items():
+        for horizon in ("full", ""):
+            for values in values_by_seed([run], LEARNED, split, metric, horizon):
+                known = [value for value in values.values() if math.isfinite(value)]
+                if known and (mean := sum(known) / len(known)) > limit:
+                    yield words.format(100 * mean)
