@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gpe_pl.evaluation.horizons import time_of
 from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, label_of
 from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.files.markdown import table_row
@@ -21,6 +22,8 @@ from gpe_pl.reports.parameter_curves import axis_label
 from gpe_pl.viz.saving import save_figure
 
 MATERIALS_FIGURE = "reads_material.png"
+FULL = "full"
+"""Horizon of whole rollouts."""
 INTERPOLATED = f"{UNSEEN}/interpolated"
 FEWEST_SCENES = 6
 """Fewest scenes from which a verdict follows. A model that does not read the material is better in all of so many by chance in 2 % of cases."""
@@ -44,12 +47,12 @@ def reads_material(runs: Sequence[Run]) -> tuple[bool, Interval, int] | None:
     return None if found is None else (found[0].high < 1, *found)
 
 
-def _over(runs: Sequence[Run], control: str) -> tuple[Interval, int] | None:
-    """Return the ratio of the errors with own parameters and with those of a control, and the number of scenes.
+def _over(runs: Sequence[Run], control: str, horizon: str = FULL) -> tuple[Interval, int] | None:
+    """Return the ratio of the errors up to a horizon with own parameters and with those of a control, and the number of scenes.
 
     Errors are means over scenes, median over seeds, and the bootstrap interval is over both.
     """
-    own, other = _errors(runs, LEARNED), _errors(runs, label_of(LEARNED, control))
+    own, other = _errors(runs, LEARNED, horizon), _errors(runs, label_of(LEARNED, control), horizon)
     scenes = shared_trajectories(own, other)
     if not scenes or len(own) != len(other):
         return None
@@ -100,7 +103,29 @@ def material_lines(groups: Groups) -> list[str]:
         f"fewer than {FEWEST_SCENES} scenes are too few to say. A model that uses the parameter, but is too inaccurate for the difference between neighbouring "
         "values, has only own / middle and own / shuffled below 1. A rollout that had to be stopped has failed, and counts as ballistic flight in that scene."
     )
-    return [*lines, "", note]
+    return [*lines, "", note, *_horizon_lines(shown)]
+
+
+def _horizon_lines(groups: Groups) -> list[str]:
+    """Return a table of the ratios at each horizon, and a note below it. Motion after many contacts is chaotic, so short horizons can tell more."""
+    horizons = _horizons(groups)
+    if not horizons:
+        return []
+    columns = [f"{what}, {horizon}" for what in ("own / nearest", "own / effect") for horizon in horizons]
+    lines = [table_row(["domain", "model", *columns]), "|" + "---|" * (2 + len(columns))]
+    for (domain, label), runs in groups.items():
+        nearest = [_ratio(found[0]) if (found := _over(runs, "nearest", horizon)) else "–" for horizon in horizons]
+        effects = [(_mean(_errors(runs, LEARNED, horizon)), _mean(_solver(runs, SOLVER_ENDS, horizon))) for horizon in horizons]
+        lines.append(table_row([domain, label, *nearest, *(f"{own / effect:.2f}" if effect > 0 else "–" for own, effect in effects)]))
+    return ["", *lines, "", "The same ratios for means over the frames up to a horizon."]
+
+
+def _horizons(groups: Groups) -> list[str]:
+    """Return the horizons of the rows, whole rollouts excluded, in ascending order."""
+    found = {
+        str(h) for runs in groups.values() for run in runs for h in run.rows.loc[run.rows["metric"] == "rollout_mse", "horizon"].unique()
+    }
+    return sorted(found - {FULL}, key=time_of)
 
 
 def write_material_figure(path: Path, groups: Groups) -> None:
@@ -143,8 +168,8 @@ def _points(runs: Sequence[Run], label: str) -> dict[float, list[float]]:
     points: dict[float, list[float]] = {}
     for run in runs:
         rows = run.rows
-        rows = rows[(rows["model"] == label) & (rows["split"] == UNSEEN) & (rows["metric"] == "rollout_mse") & (rows["horizon"] == "full")]
-        for seed in rollout_errors([run], UNSEEN, "full", label):
+        rows = rows[(rows["model"] == label) & (rows["split"] == UNSEEN) & (rows["metric"] == "rollout_mse") & (rows["horizon"] == FULL)]
+        for seed in rollout_errors([run], UNSEEN, FULL, label):
             for trajectory, parameter in zip(rows["trajectory"], rows["parameter"], strict=True):
                 if np.isfinite(parameter):
                     points.setdefault(float(parameter), []).append(seed[int(trajectory)])
@@ -158,13 +183,13 @@ def _without(groups: Groups, domain: str, runs: Sequence[Run]) -> list[Run]:
     return [run for run in others if run.config.get(EMBEDDING) == WITHOUT]
 
 
-def _errors(runs: Sequence[Run], label: str) -> Values:
-    return rollout_errors(list(runs), INTERPOLATED, "full", label)
+def _errors(runs: Sequence[Run], label: str, horizon: str = FULL) -> Values:
+    return rollout_errors(list(runs), INTERPOLATED, horizon, label)
 
 
-def _solver(runs: Sequence[Run], label: str) -> Values:
+def _solver(runs: Sequence[Run], label: str, horizon: str = FULL) -> Values:
     """Return values of the solver, which are the same in all runs of a domain."""
-    return values_by_seed(list(runs[:1]), label, INTERPOLATED, "rollout_mse", "full")
+    return values_by_seed(list(runs[:1]), label, INTERPOLATED, "rollout_mse", horizon)
 
 
 def _mean(values: Values) -> float:
