@@ -73,7 +73,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     folder = Path(cfg.paths.runs) / run_name(cfg.name)
     with locked(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
         root = ensure_split(evaluated, cfg.split)
-        claim(folder, _identity(evaluated, root), results=["*"])
+        claim(folder, _identity(evaluated, root, simulator), results=["*"])
         with without_orphans(folder):
             try:
                 start_frame = settings.first_frame(simulator.builder.config.history, scene.frame_dt)
@@ -123,7 +123,7 @@ def _checkpoints(cfg: DictConfig) -> list[str]:
     return given
 
 
-def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
+def _identity(cfg: DictConfig, root: Path, simulator: LearnedSimulator) -> dict[str, Any]:
     """Return the settings and checksums on which the metrics of an evaluation depend. If one of them differs, the evaluation needs another folder."""
     from omegaconf import OmegaConf
 
@@ -142,6 +142,7 @@ def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
     return {
         "checkpoint": prints[0] if len(prints) == 1 else prints,
         **bands,
+        "model": {"_target_": simulator.description()["model"], "material_embedding": simulator.model.settings.get("material_embedding")},
         "split": cfg.split,
         DATA_CHECKSUMS: {cfg.split: split_checksum(root, cfg.split)},
         "evaluation": evaluation,

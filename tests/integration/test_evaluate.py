@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -73,6 +74,8 @@ def test_a_folder_keeps_the_evaluation_that_it_holds(tiny_data: Path, tmp_path: 
     again = evaluate(tiny_data, tmp_path, run, "evaluation.num_pictures=1")  # the same numbers, and a picture
     assert {key(r): r.value for r in again} == pytest.approx({key(r): r.value for r in rows}, rel=1e-12)
     assert (folder / "rollout_test_unseen_00.png").exists()
+    model = json.loads((folder / "config.json").read_text())["model"]
+    assert model == {"_target_": "gpe_pl.models.gpe.GPE", "material_embedding": "affine"}  # so tables find the models without the parameter
     before = (folder / "metrics.csv").read_bytes()
     with pytest.raises(
         RunError,

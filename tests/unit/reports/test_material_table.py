@@ -37,6 +37,10 @@ def write_run(
         for k, error in enumerate(HARD):
             value = 1e-3 * factor * error * (1 + 0.3 * seed)
             rows.append(Row(labels[name], UNSEEN, 2 * k, "interpolated", 20.5 + k, "rollout_mse", "full", value))
+            rows.append(
+                Row(labels[name], UNSEEN, 2 * k, "interpolated", 20.5 + k, "rollout_mse", "0.1s", value * (0.5 if name == "own" else 1.0))
+            )
+            rows.append(Row(labels[name], UNSEEN, 2 * k, "interpolated", 20.5 + k, "rollout_mse", "0.025s", value))
             rows.append(Row(labels[name], UNSEEN, 2 * k + 1, "extrapolated", 50.0 + k, "rollout_mse", "full", 1.0))
     write_rows(folder / "metrics.csv", rows)
 
@@ -118,3 +122,17 @@ def test_runs_without_controls_have_no_table(tmp_path: Path) -> None:
     assert reads_material(runs) is None and verdict(runs) == "" and material_lines({("sand", "GPE"): runs}) == []
     sweep_table.report(tmp_path / "run")
     assert not (tmp_path / "run" / "reads_material.png").exists() and "reads the material" not in sweep_table.conclusion(tmp_path / "run")
+
+
+def test_short_horizons_have_ratios_of_their_own(tmp_path: Path) -> None:
+    write_run(tmp_path / "run", "affine", 0, READS)
+    runs = finished_runs(tmp_path)
+    lines = material_lines({("sand", "GPE"): runs})
+    header, row = (next(line for line in lines if "own / nearest, 0.025s" in line), lines[-3])
+    found = dict(zip(cells_of(header), cells_of(row), strict=True))
+    assert found["own / nearest, 0.025s"] == "0.90 [0.90, 0.90]" and found["own / nearest, 0.1s"] == "0.45 [0.45, 0.45]"
+    assert found["own / effect, 0.025s"] == "0.60" and found["own / effect, 0.1s"] == "0.30"
+
+
+def cells_of(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip("|").split("|")]
