@@ -1,0 +1,338 @@
+"""The suite of other people's physics: experiments and published scaling laws beside solver and model, and what can be compared besides.
+
+Nothing is fetched from a network. The suite uses files in a folder of the user and installed packages, and names what is missing and how to get it.
+
+- ``dam_break``: front of a collapsing column of water, Martin and Moyce 1952 and Koshizuka and Oka 1996, as Z = z/a over T = t √(2g/a) with the width a.
+- ``column_collapse``: run-out of columns of sand, Lube et al. 2005: Δl/l = 1.2 a for a < 1.8, otherwise 1.9 a^(2/3), with a the height over the half width l.
+- ``droplet``: radius of a viscous drop on a floor, Huppert 1982: r = 0.894 (g V³ / 3ν)^(1/8) t^(1/8).
+
+The first frames of a model are the solver's, because a model needs a history.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from gpe_pl.benchmarks.acceptance import scenes
+from gpe_pl.benchmarks.acceptance.trial import Candidate, tried
+from gpe_pl.benchmarks.trained import Case, checkpoint_label, of_stored_frames
+from gpe_pl.data.ground_truth import DatasetSpec
+from gpe_pl.errors import GpeError
+from gpe_pl.files.markdown import table_row
+from gpe_pl.geometry.shapes import domain_walls
+from gpe_pl.solvers.scenes import JITTER, integer_lattice
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+log = logging.getLogger(__name__)
+
+Experiment = Literal["dam_break", "column_collapse", "droplet"]
+DAM_BREAK_FILE = "dam_break_front.csv"
+FRONT = 0.98
+"""Fraction of the particles within the front, so that single drops and grains do not count."""
+DAM_SECONDS, COLUMN_SECONDS, DROP_SECONDS = 0.4, 1.0, 1.0
+DAM_WIDTH = 0.25
+"""Width of the column of water as a fraction of the domain. Its height is twice the width, as in the experiments."""
+HALF_WIDTH, ASPECTS = 6, (1, 2, 3)
+"""Half width of columns of sand in spacings, and their ratios of height to half width."""
+DROP_RADIUS, DROP_HEIGHT = 4, 4
+"""Radius and height of the drop at the start, in spacings."""
+SLUMPED = 0.2
+"""Fraction of the time before which the radius of the drop is not compared: the law holds when inertia no longer matters."""
+
+ENGINES = {
+    "KratosMultiphysics.MPMApplication": ("Kratos MPM", "pip install KratosMPMApplication"),
+    "pysplishsplash": ("SPlisHSPlasH", "pip install pysplishsplash"),
+}
+"""Other engines by module: name, and how to get them."""
+PUBLIC = {
+    "data_FluidFall": "DPI-Net's FluidFall, github.com/YunzhuLi/DPI-Net",
+    "data_BoxBath": "DPI-Net's BoxBath, github.com/YunzhuLi/DPI-Net",
+    "data_RiceGrip": "DPI-Net's RiceGrip, github.com/YunzhuLi/DPI-Net",
+    "data_RigidFall": "VGPL's RigidFall, github.com/YunzhuLi/VGPL-Dynamics-Prior",
+}
+"""Public data sets by the names of their folders."""
+
+
+class OutsideError(GpeError, ValueError):
+    """Raised when a checkpoint was trained on none of the suite's data sets, or a file of the user cannot be read; the message names it."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the suite.
+
+    Attributes:
+        cases: data sets, by name; each checkpoint must have been trained on one of them.
+        folder: folder of the user's files.
+        checkpoints: models as paths of checkpoints, folders of runs, or names of shipped models.
+        experiments: experiments to run.
+        num_threads: threads of PyTorch; the solvers use one.
+    """
+
+    cases: dict[str, Case]
+    folder: str = "outside"
+    checkpoints: Annotated[list[str], Field(min_length=1)] = field(default_factory=lambda: ["fluid", "sand"])
+    experiments: list[Experiment] = field(default_factory=lambda: ["dam_break", "column_collapse", "droplet"])
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values ``y`` over ``x`` of one series of an experiment."""
+
+    series: str
+    x: np.ndarray
+    y: np.ndarray
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Labels of the axes of an experiment, and how it differs from the simulated scene."""
+
+    x: str
+    y: str
+    difference: str
+
+
+AXES: dict[str, Axes] = {
+    "dam_break": Axes(
+        "T = t √(2g/a)", "front Z = z/a", "walls without slip and liquid of the lowest trained viscosity; the experiments have water"
+    ),
+    "column_collapse": Axes(
+        "a = height / half width", "run-out Δl/l", "plane columns on a rough floor; the law is a fit to experiments with quartz sand"
+    ),
+    "droplet": Axes("t [s]", "radius r [m]", "a film of one or two particles at the end; the law is for thin films without inertia"),
+}
+
+
+def run(settings: Settings, specs: Mapping[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
+    """Return a record per curve and per missing thing, and a Markdown report.
+
+    Raises:
+        OutsideError: a checkpoint was trained on none of ``specs``, or a file of the user cannot be read.
+    """
+    torch.set_num_threads(settings.num_threads)
+    folder = Path(settings.folder).expanduser()
+    candidates = [_candidate(checkpoint, specs) for checkpoint in settings.checkpoints]
+    records = list[dict[str, Any]]()
+    for experiment in settings.experiments:
+        measure, material = MEASURED[experiment]
+        for candidate in [c for c in candidates if scenes.material_of(c.spec) == material]:
+            log.info("%s: %s", experiment, candidate.name)
+            for curve in measure(candidate, folder):
+                about = {"experiment": experiment, "model": candidate.name, "series": curve.series}
+                records.append(about | {"x": curve.x.round(6).tolist(), "y": curve.y.round(6).tolist()})
+    missing = _missing(folder, settings.experiments)
+    records += [{"missing": name, "remedy": remedy} for name, remedy in missing]
+    return records, _report(records, missing, folder)
+
+
+def _candidate(checkpoint: str, specs: Mapping[str, DatasetSpec]) -> Candidate:
+    simulator = of_stored_frames(checkpoint)
+    own = simulator.builder.metadata
+    fitting = [s for s in specs.values() if s.name == own.dataset and abs(s.scene.spacing / own.spacing - 1) < 0.01]
+    if not fitting or len(own.materials) > 1:
+        raise OutsideError(f"{checkpoint}: was trained on {own.dataset}, the suite has {', '.join(specs)}; add the data set to suite.cases")
+    return Candidate(checkpoint_label(checkpoint), simulator, fitting[0])
+
+
+def _missing(folder: Path, experiments: Sequence[str]) -> list[tuple[str, str]]:
+    """Return what is not there, each with how to get it."""
+    found = []
+    if "dam_break" in experiments and not (folder / DAM_BREAK_FILE).is_file():
+        found.append(
+            (
+                f"measured fronts of dam breaks, {folder / DAM_BREAK_FILE}",
+                "columns series, T, Z; from the papers named in gpe_pl.benchmarks.outside",
+            )
+        )
+    for module, (name, remedy) in ENGINES.items():
+        if importlib.util.find_spec(module.partition(".")[0]) is None:
+            found.append((name, remedy))
+    found += [(about, f"put its folder into {folder}") for name, about in PUBLIC.items() if not (folder / name).is_dir()]
+    return found
+
+
+# --- experiments ----------------------------------------------------------------------------------------------------------------------------
+
+
+def _dam_break(candidate: Candidate, folder: Path) -> list[Curve]:
+    spec, value = candidate.spec, candidate.values[0]
+    low, high = np.array(spec.scene.bounds, float).T
+    spacing, width = spec.scene.spacing, DAM_WIDTH * (high - low)[0]
+    size = [width, *(high - low)[1:-1], 2 * width]
+    trial = tried(candidate, value, _filled(spec, value, low, np.round(np.array(size) / spacing).astype(int)), DAM_SECONDS)
+    curves = measured_fronts(folder / DAM_BREAK_FILE) if (folder / DAM_BREAK_FILE).is_file() else []
+    gravity = abs(spec.scene.gravity[-1])
+    for series, trajectory in (("solver", trial.truth), ("model", trial.model)):
+        front = np.quantile(trajectory.pos[..., 0], FRONT, axis=1) + spacing / 2 - low[0]
+        curves.append(Curve(series, _times(trajectory) * np.sqrt(2 * gravity / width), front / width))
+    return curves
+
+
+def measured_fronts(path: Path) -> list[Curve]:
+    """Return the measured fronts of a file with the columns ``series``, ``T`` and ``Z``.
+
+    Raises:
+        OutsideError: the file has other columns, or a value is not a number.
+    """
+    found: dict[str, list[tuple[float, float]]] = {}
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            for row in csv.DictReader(file):
+                found.setdefault(row["series"], []).append((float(row["T"]), float(row["Z"])))
+    except (KeyError, ValueError, TypeError) as error:
+        raise OutsideError(f"{path}: expected the columns series, T and Z with numbers ({error})") from None
+    return [Curve(series, *np.array(sorted(points)).T) for series, points in found.items()]
+
+
+def _column_collapse(candidate: Candidate, _: Path) -> list[Curve]:
+    spec, aspects = candidate.spec, np.array(ASPECTS, float)
+    runs: dict[str, list[float]] = {"solver": [], "model": []}
+    middle, half = scenes.middle_of_floor(spec)[0], HALF_WIDTH * spec.scene.spacing
+    for aspect in ASPECTS:
+        start = scenes.column(spec, candidate.values[1], 2 * HALF_WIDTH, aspect * HALF_WIDTH)
+        trial = tried(candidate, candidate.values[1], start, COLUMN_SECONDS)
+        for series, trajectory in (("solver", trial.truth), ("model", trial.model)):
+            reach = np.quantile(np.abs(trajectory.pos[-1, :, 0] - middle), FRONT) + spec.scene.spacing / 2
+            runs[series].append(reach / half - 1 if trajectory.termination is None else np.nan)
+    return [
+        Curve("Lube et al. 2005", aspects, run_out(aspects)),
+        *(Curve(series, aspects, np.array(values)) for series, values in runs.items()),
+    ]
+
+
+def run_out(aspect: np.ndarray) -> np.ndarray:
+    """Return the published run-out Δl/l of plane columns with these ratios of height to half width."""
+    return np.where(aspect < 1.8, 1.2 * aspect, 1.9 * aspect ** (2 / 3))
+
+
+def _droplet(candidate: Candidate, _: Path) -> list[Curve]:
+    spec, value = candidate.spec, candidate.values[2]
+    spacing, floor = spec.scene.spacing, scenes.middle_of_floor(spec)
+    lattice = (
+        integer_lattice(np.array([-DROP_RADIUS, -DROP_RADIUS, 0]), np.array([DROP_RADIUS - 1, DROP_RADIUS - 1, DROP_HEIGHT - 1])) + 0.5
+    )
+    lattice = lattice[np.linalg.norm(lattice[:, :2], axis=1) <= DROP_RADIUS]
+    pos = floor + spacing * (lattice + np.random.default_rng(0).uniform(-JITTER, JITTER, lattice.shape))
+    state = scenes.start(spec, value, pos, np.zeros(3), domain_walls(spec.scene.bounds, spec.scene.friction))  # type: ignore[attr-defined]
+    trial = tried(candidate, value, state, DROP_SECONDS)
+    volume, gravity = len(pos) * spacing**3, abs(spec.scene.gravity[-1])
+    curves = []
+    for series, trajectory in (("solver", trial.truth), ("model", trial.model)):
+        radius = np.quantile(np.linalg.norm(trajectory.pos[..., :2] - floor[:2], axis=-1), FRONT, axis=1) + spacing / 2
+        curves.append(Curve(series, _times(trajectory), radius))
+    times = np.linspace(SLUMPED, 1.0, 20) * DROP_SECONDS
+    return [Curve("Huppert 1982", times, drop_radius(times, volume, value, gravity)), *curves]
+
+
+def drop_radius(times: np.ndarray, volume: float, viscosity: float, gravity: float) -> np.ndarray:
+    """Return the published radius [m] of a viscous drop at some times [s], with volume [m³], kinematic viscosity [m²/s] and gravity [m/s²]."""
+    return np.asarray(0.894 * (gravity * volume**3 / (3 * viscosity) * times) ** (1 / 8))
+
+
+MEASURED: dict[str, tuple[Callable[[Candidate, Path], list[Curve]], str]] = {
+    "dam_break": (_dam_break, "fluid"),
+    "column_collapse": (_column_collapse, "sand"),
+    "droplet": (_droplet, "fluid"),
+}
+"""Function and material of each experiment."""
+
+
+def _filled(spec: DatasetSpec, value: float, low: np.ndarray, counts: np.ndarray) -> State:
+    """Return jittered particles at rest that fill a box of ``counts`` particles per axis at a corner of the domain."""
+    lattice = integer_lattice(np.zeros(len(counts), int), counts - 1) + 0.5
+    pos = low + spec.scene.spacing * (lattice + np.random.default_rng(0).uniform(-JITTER, JITTER, lattice.shape))
+    walls = domain_walls(spec.scene.bounds, spec.scene.friction)  # type: ignore[attr-defined]
+    return scenes.start(spec, value, pos, np.zeros(len(counts)), walls)
+
+
+def _times(trajectory: Trajectory) -> np.ndarray:
+    return trajectory.start_time + trajectory.metadata.frame_dt * np.arange(trajectory.num_frames)
+
+
+# --- report ---------------------------------------------------------------------------------------------------------------------------------
+
+
+def deviation(own: Curve, reference: Curve) -> tuple[float, int]:
+    """Return the mean relative deviation of a curve from the points of a reference within its range, and the number of these points."""
+    inside = (reference.x >= own.x.min()) & (reference.x <= own.x.max())
+    if not inside.any():
+        return float("nan"), 0
+    expected = reference.y[inside]
+    return float(np.mean(np.abs(np.interp(reference.x[inside], own.x, own.y) - expected) / expected)), int(inside.sum())
+
+
+def _curves(records: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str], list[Curve]]:
+    found: dict[tuple[str, str], list[Curve]] = {}
+    for r in records:
+        if "experiment" in r:
+            found.setdefault((r["experiment"], r["model"]), []).append(Curve(r["series"], np.array(r["x"]), np.array(r["y"])))
+    return found
+
+
+def _report(records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, str]], folder: Path) -> str:
+    lines = [table_row(["experiment", "model", "reference", "points", "solver", "model"]), "|" + "---|" * 6]
+    for (experiment, model), curves in _curves(records).items():
+        by_name = {curve.series: curve for curve in curves}
+        for reference in [curve for curve in curves if curve.series not in ("solver", "model")]:
+            values = [deviation(by_name[series], reference) for series in ("solver", "model")]
+            cells = ["not measured" if np.isnan(value) else f"{100 * value:.1f} %" for value, _ in values]
+            lines.append(table_row([experiment, model, reference.series, str(values[0][1]), *cells]))
+    lines += [
+        "",
+        "Mean relative deviation from the points of the reference that the rollout reaches. The model's first frames are the solver's.",
+    ]
+    lines += [
+        f"- {experiment}: {axes.difference}." for experiment, axes in AXES.items() if any(experiment == key for key, _ in _curves(records))
+    ]
+    commands = [
+        f"`python -m gpe_pl.convert format=dpinet source={folder / name} name={name.lower()} leave_out=0`, then "
+        f"`python -m gpe_pl.fit data=imported data.name={name.lower()} name={name.lower()}`"
+        for name in PUBLIC
+        if (folder / name).is_dir()
+    ]
+    if commands:
+        lines += ["", "Public data sets that are there; train and evaluate on them with:", "", *(f"- {command}" for command in commands)]
+    if missing:
+        lines += ["", "Missing, and how to get it:", "", *(f"- {name}: {remedy}" for name, remedy in missing)]
+    return "\n".join(lines)
+
+
+def figures(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
+    """Draw one figure per experiment and model: experiment or law, solver and model on the same axes."""
+    import matplotlib.pyplot as plt
+
+    drawn = {}
+    for (experiment, model), curves in _curves(records).items():
+        figure, axes = plt.subplots(figsize=(5.2, 3.6), layout="constrained")
+        limit = max((curve.x.max() for curve in curves if curve.series == "solver"), default=np.inf)
+        for curve in curves:
+            is_run = curve.series in ("solver", "model")
+            shown = curve.x <= 1.1 * limit
+            style = (
+                {"linestyle": "-" if curve.series == "solver" else "--"}
+                if is_run
+                else {"linestyle": "none", "marker": "o", "markersize": 4}
+            )
+            if experiment == "column_collapse":
+                style |= {"marker": "o"}
+            axes.plot(curve.x[shown], curve.y[shown], label=curve.series.replace("_", " "), **style)
+        axes.set(xlabel=AXES[experiment].x, ylabel=AXES[experiment].y, title=f"{experiment.replace('_', ' ')}, {model}")
+        axes.legend(fontsize="small")
+        drawn[f"{experiment}_{model}"] = figure
+    return drawn

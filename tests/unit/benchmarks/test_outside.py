@@ -1,0 +1,54 @@
+"""The suite of other people's physics: published laws, measured fronts, deviations, and what is missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpe_pl.benchmarks import outside
+from gpe_pl.benchmarks.outside import Curve, OutsideError, deviation, drop_radius, measured_fronts, run_out
+
+
+def test_run_out_is_that_of_the_published_fit() -> None:
+    np.testing.assert_allclose(run_out(np.array([1.0, 8.0])), [1.2, 7.6])
+
+
+def test_a_drop_spreads_with_the_eighth_root_of_time_and_the_volume_is_conserved_by_units() -> None:
+    one = drop_radius(np.array([1.0, 256.0]), 0.01, 0.5, 9.81)
+    assert one[1] / one[0] == pytest.approx(2.0)
+    assert one[0] == pytest.approx(0.894 * (9.81 * 1e-6 / 1.5) ** 0.125)
+
+
+def test_deviations_count_only_points_that_the_run_reaches() -> None:
+    own = Curve("solver", np.array([0.0, 1.0]), np.array([0.0, 2.0]))
+    assert deviation(own, Curve("law", np.array([0.5, 1.0, 3.0]), np.array([2.0, 2.0, 9.0]))) == (pytest.approx(0.25), 2)
+    value, count = deviation(own, Curve("law", np.array([3.0]), np.array([9.0])))
+    assert np.isnan(value) and count == 0
+
+
+def test_fronts_are_read_by_series_and_in_order(tmp_path: Path) -> None:
+    path = tmp_path / outside.DAM_BREAK_FILE
+    path.write_text("series,T,Z\na,2,3\nb,0,1\na,1,2\n")
+    a, b = measured_fronts(path)
+    assert (a.series, a.x.tolist(), a.y.tolist(), b.series) == ("a", [1.0, 2.0], [2.0, 3.0], "b")
+    path.write_text("time,front\n1,2\n")
+    with pytest.raises(OutsideError, match="expected the columns series, T and Z"):
+        measured_fronts(path)
+
+
+def test_the_report_names_what_is_missing_and_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outside, "ENGINES", {"no_such_engine.part": ("Engine", "pip install engine")})
+    (tmp_path / "data_FluidFall").mkdir()
+    missing = outside._missing(tmp_path, ["dam_break"])
+    names = [name for name, _ in missing]
+    assert names[0].startswith("measured fronts of dam breaks") and "Engine" in names and not any("FluidFall" in name for name in names)
+    line = Curve("solver", np.array([1.0, 3.0]), np.array([1.0, 3.0]))
+    curves = [Curve("law", np.array([2.0]), np.array([4.0])), line, Curve("model", np.array([1.0, 3.0]), np.array([np.nan, np.nan]))]
+    records = [{"experiment": "droplet", "model": "m", "series": c.series, "x": c.x.tolist(), "y": c.y.tolist()} for c in curves]
+    text = outside._report(records, missing, tmp_path)
+    assert "| droplet | m | law | 1 | 50.0 % | not measured |" in text
+    assert "- Engine: pip install engine" in text
+    assert f"source={tmp_path / 'data_FluidFall'} name=data_fluidfall leave_out=0" in text
+    assert outside.figures(records).keys() == {"droplet_m"}
