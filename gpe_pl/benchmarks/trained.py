@@ -154,9 +154,15 @@ def fingerprint_of(simulator: LearnedSimulator) -> str:
 
 
 def model_label(simulator: LearnedSimulator) -> str:
-    """Return a label: the model's class, depth × width, and the values of all other settings that differ from their defaults."""
+    """Return a label: the model's class, depth × width, and all other settings that differ from their defaults: texts by value, switches by name."""
     cls, settings = type(simulator.model), dict(simulator.description()["settings"])
     depth = next((settings.pop(k) for k in DEPTHS if k in settings), "")
     plain = cls(simulator.builder.spec).settings
-    other = [str(v) for k, v in settings.items() if k != "hidden_channels" and v != plain.get(k)]
+    other = [_setting(k, v) for k, v in settings.items() if k != "hidden_channels" and v != plain.get(k)]
     return " ".join([f"{cls.__name__} {depth} × {settings['hidden_channels']}", *other])
+
+
+def _setting(name: str, value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    return name if value is True else f"{name}={value}"
