@@ -71,7 +71,8 @@ class Settings:
 
     Attributes:
         cases: data sets, by name.
-        runs: folders of finished runs; their models take part in the case whose data set they were trained on.
+        runs: folders of finished runs. Their models take part in cases with the scenes of their data set and labels as fine as theirs or finer. All learned
+            models of a case start where the one with the longest history can.
         factors: factors by which the solver is also run at a coarser spacing than the data.
         step_factors: factors by which the solver's steps may also be longer, at the spacing of the data and at coarser ones.
         soft_factors: factors by which the solver's elastic moduli may also be smaller, where they are constants of the solver (``solver_rungs.softer``).
@@ -187,6 +188,7 @@ def compare(
         folder: folder for finished scenes and reference solutions; None stores neither.
         case: name of the case, for the progress bar.
     """
+    first = _first_frame(spec, entrants)
     points: dict[str, Point] = {}
     orders = []
     identity = _identity(spec, entrants, settings)
@@ -197,7 +199,7 @@ def compare(
             known = {**identity, "index": index}
             scene = parts.get(known) if parts else None
             if scene is None:
-                scene = list(_scene(spec, index, entrants, settings, None if folder is None else folder / REFERENCES))
+                scene = list(_scene(spec, index, first, entrants, settings, None if folder is None else folder / REFERENCES))
                 if parts:
                     parts.put(known, scene)
             orders += [_number(record["order"]) for record in scene if "order" in record]
@@ -213,6 +215,22 @@ def compare(
         points[label].overhead = entrant.spent.seconds(rates, float(getattr(spec.scene, "num_particles", math.nan)))
         points[label].teacher = entrant.teacher
     return [*points.values()], float(np.nanmedian(orders))
+
+
+def _first_frame(spec: DatasetSpec, entrants: dict[str, Entrant]) -> int:
+    """Return the first frame for which all learned models have enough history.
+
+    Raises:
+        ComparisonError: scenes end before it.
+    """
+    needed = {label: e.simulator.stride * e.simulator.builder.config.history for label, e in entrants.items()}
+    label = max(needed, key=needed.__getitem__)
+    if needed[label] > spec.num_frames - 2:
+        raise ComparisonError(
+            f"{spec.name}: {label} needs {needed[label]} frames before its first step, and scenes have {spec.num_frames}; "
+            "leave its run out of suite.runs, or choose longer scenes (data.num_frames)"
+        )
+    return needed[label]
 
 
 def _nodes(spec: DatasetSpec) -> str:
@@ -237,10 +255,12 @@ def _finite(value: float) -> float | None:
 
 
 def _scene(
-    spec: DatasetSpec, index: int, entrants: dict[str, Entrant], settings: Settings, references: Path | None
+    spec: DatasetSpec, index: int, first: int, entrants: dict[str, Entrant], settings: Settings, references: Path | None
 ) -> Iterator[dict[str, Any]]:
-    """Run all simulators on one scene; yield the observed order, and a record for each simulator. Errors of failed rollouts are None."""
-    first = max(e.simulator.stride * e.simulator.builder.config.history for e in entrants.values())
+    """Run all simulators on one scene, learned models from frame ``first``.
+
+    Yield the observed order, and a record for each simulator. Errors of failed rollouts are None.
+    """
     reference = stored_reference(spec, settings.split, index, references)
     yield {"order": _finite(observed_order(spec, settings.split, index, reference))}
     start = initial_state(spec, settings.split, index)

@@ -365,3 +365,9 @@ def test_emulator_superiority_is_against_the_solver_of_the_labels() -> None:
     assert "solver of its labels): model (@full): the interval lies below 1." in text
     model.teacher = DATA
     assert "solver of its labels): no model is, at any horizon." in section("snow", [data, teacher, model], 1.0, 3)
+
+
+def test_a_scene_that_is_too_short_for_a_model_is_refused() -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    with pytest.raises(ComparisonError, match="sand: long needs 24 frames before its first step, and scenes have 24; leave"):
+        compare(spec, {"short": Entrant(untrained(), Spent(0.0)), "long": Entrant(untrained(12), Spent(0.0))}, Settings({}, []))
