@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 NOTICE = "interrupted"
 STATUS = 130
 """Exit status after Ctrl-C, following the convention of shells."""
-COMMANDS = ("fit", "simulate", "evaluate", "benchmark", "convert")
+COMMANDS = ("fit", "simulate", "evaluate", "identify", "benchmark", "convert")
 
 
 def begin() -> None:

@@ -37,7 +37,7 @@ def commands() -> dict[str, tuple[str, list[str]]]:
             *re.findall(r"`((?:python -m gpe_pl\.|gpe )[^`]+)`", page.read_text()),
         ]
         for command in (part.strip() for line in lines for part in line.split("&&")):
-            if match := re.match(r"(?:python -m gpe_pl\.|gpe )(fit|simulate|evaluate|benchmark|convert)\b(.*)", command):
+            if match := re.match(r"(?:python -m gpe_pl\.|gpe )(fit|simulate|evaluate|identify|benchmark|convert)\b(.*)", command):
                 words = [word for word in shlex.split(match[2], comments=True) if word not in NO_COMPOSITION]
                 if not any("…" in word or word.isupper() for word in words):
                     found[f"{match[1]} {' '.join(words)}"] = match[1], [re.sub(r"^([^=\[{]+=[^,\[{]+),.*", r"\1", word) for word in words]
@@ -78,7 +78,7 @@ def test_tables_name_every_choice(page: str, key: str) -> None:
     assert named(page, key) == choices
 
 
-@pytest.mark.parametrize("command", ["fit", "evaluate", "simulate", "benchmark"])
+@pytest.mark.parametrize("command", ["fit", "evaluate", "simulate", "identify", "benchmark"])
 def test_help_names_every_choice(command: str) -> None:
     file = OmegaConf.load(ROOT / "conf" / f"{command}.yaml")
     listed = listed_help(file)
@@ -91,7 +91,7 @@ def test_help_names_every_choice(command: str) -> None:
         assert re.search(rf"^(?:\w+, )?{key}\b", listed, re.MULTILINE), f"{command} --help does not have {key}"
 
 
-@pytest.mark.parametrize("command", ["fit", "evaluate", "simulate", "benchmark", "convert"])
+@pytest.mark.parametrize("command", ["fit", "evaluate", "simulate", "identify", "benchmark", "convert"])
 def test_help_says_the_defaults(command: str) -> None:
     GlobalHydra.instance().clear()
     file, cfg = OmegaConf.load(ROOT / "conf" / f"{command}.yaml"), compose(command, [])

@@ -343,12 +343,12 @@ def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
         call(monkeypatch, tmp_path, task)
 
 
-@pytest.mark.parametrize("command", ["fit", "simulate", "evaluate", "benchmark", "convert"])
+@pytest.mark.parametrize("command", ["fit", "simulate", "evaluate", "identify", "benchmark", "convert"])
 def test_the_log_of_a_command_has_its_name(command: str) -> None:
     assert OmegaConf.load(Path(CONF) / f"{command}.yaml").hydra.job.name == command
 
 
-@pytest.mark.parametrize("command", ["fit", "simulate", "evaluate", "benchmark", "convert"])
+@pytest.mark.parametrize("command", ["fit", "simulate", "evaluate", "identify", "benchmark", "convert"])
 def test_the_settings_of_a_command_are_known_to_it(command: str) -> None:
     configuration._check_top_level(compose(command), command)
 

@@ -1,0 +1,1 @@
+"""Identification: observed motion in, material parameters out, with intervals."""

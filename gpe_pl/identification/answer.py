@@ -1,0 +1,164 @@
+"""Answers: values of the unknowns of one scene with their intervals, as a line for readers and as a file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.files import sealed
+from gpe_pl.identification.calibration import Calibration, Pairs
+from gpe_pl.identification.unknowns import Unknown
+
+ADVICE = "delete the file and identify the scene again"
+MODEL, SOLVER = "model", "solver"
+FOLDER = "scenes"
+"""Subfolder of a results folder with one file per scene and simulator."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """Answer for one unknown.
+
+    Attributes:
+        name, label, unit, is_log: as in ``Unknown``.
+        raw: value with the smallest misfit.
+        scale: scale of its error, in coordinates (the value, or its natural logarithm if ``is_log``).
+        estimate, low, high: corrected value and ends of its interval.
+        at_bound: ``lower`` or ``upper`` if ``raw`` lies at a bound, else empty.
+        truth: stored value; None if it is unknown.
+        text: estimate with unit, and interval, for readers.
+    """
+
+    name: str
+    label: str
+    unit: str
+    is_log: bool
+    raw: float
+    scale: float
+    estimate: float
+    low: float
+    high: float
+    at_bound: str
+    truth: float | None
+    text: str
+
+    @property
+    def short(self) -> str:
+        return self.text.partition(" (")[0]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Answer for one scene by one simulator.
+
+    Attributes:
+        scene: name of the scene.
+        simulator: ``model`` or ``solver``.
+        values: answers for the unknowns.
+        level: nominal coverage of the intervals.
+        num_calibration: number of scenes that the intervals were calibrated on; 0 if they are not calibrated.
+        method: ``gradient`` or ``derivative_free``.
+        gradients: result of the check of gradients; empty if there was none.
+        misfit: smallest misfit.
+        num_windows, length: number of rollouts, and of frames of each.
+        num_evaluations, num_gradients: numbers of misfits and gradients that were computed.
+        seconds, processor_seconds: time of the search and the intervals.
+        tried: values of the unknowns and the misfit, for every misfit of the search.
+    """
+
+    scene: str
+    simulator: str
+    values: tuple[Value, ...]
+    level: float
+    num_calibration: int
+    method: str
+    gradients: str
+    misfit: float
+    num_windows: int
+    length: int
+    num_evaluations: int
+    num_gradients: int
+    seconds: float
+    processor_seconds: float
+    tried: tuple[tuple[float, ...], ...]
+
+    def __getitem__(self, name: str) -> Value:
+        """Return the answer for an unknown by its name, such as ``sand.friction_angle``."""
+        return next(value for value in self.values if value.name == name)
+
+    def __str__(self) -> str:
+        lines = [f"{value.label} {value.text}" + (f", at the {value.at_bound} bound" if value.at_bound else "") for value in self.values]
+        return "; ".join(lines) + ("" if self.num_calibration else " [interval not calibrated]")
+
+    def write(self, folder: Path) -> None:
+        """Write the answer to a file in a results folder."""
+        path = answer_path(folder, self.scene, self.simulator)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        sealed.write(path, asdict(self))
+
+
+def answer_path(folder: Path, scene: str, simulator: str) -> Path:
+    """Return the path of an answer's file in a results folder."""
+    return folder / FOLDER / f"{scene}_{simulator}.json"
+
+
+def read_answer(path: Path) -> Answer:
+    """Read an answer that ``Answer.write`` wrote; raises ``SealError`` if the file was changed."""
+    found: dict[str, Any] = sealed.read(path, ADVICE)
+    values = tuple(Value(**value) for value in found.pop("values"))
+    return Answer(values=values, tried=tuple(map(tuple, found.pop("tried"))), **found)
+
+
+def read_answers(folder: Path, simulator: str) -> list[Answer]:
+    """Read all answers of one simulator in a results folder, in the order of their scenes."""
+    return [read_answer(path) for path in sorted((folder / FOLDER).glob(f"*_{simulator}.json"))]
+
+
+def value_of(unknown: Unknown, raw: float, z: float, scale: float, calibration: Calibration) -> Value:
+    """Return the answer for an unknown.
+
+    Args:
+        unknown: the unknown.
+        raw: its value with the smallest misfit.
+        z: the same as a number from 0 to 1.
+        scale: scale of the error, in coordinates.
+        calibration: correction and interval.
+    """
+    estimate, low, high = map(unknown.value, calibration.interval(unknown.coordinate(raw), scale))
+    text = f"{unknown.text(estimate)} ({100 * calibration.level:g} %: {low:.3g}–{high:.3g})"
+    if unknown.unit == "Pa":
+        text = f"{unknown.text(estimate)} ({100 * calibration.level:g} %: {unknown.text(low)}–{unknown.text(high)})"
+    truth = unknown.truth if math.isfinite(unknown.truth) else None
+    return Value(
+        unknown.name, unknown.label, unknown.unit, unknown.is_log, raw, scale, estimate, low, high, unknown.bound_of(z), truth, text
+    )  # fmt: skip
+
+
+def pairs_of(answers: Iterable[Answer]) -> dict[str, Pairs]:
+    """Return estimates, true values and scales by name of the unknown, in coordinates, of all answers whose truth is known."""
+    found: dict[str, list[tuple[float, float, float]]] = {}
+    for answer in answers:
+        for value in answer.values:
+            if value.truth is not None:
+                change = math.log if value.is_log else float
+                found.setdefault(value.name.partition("#")[0], []).append((change(value.raw), change(value.truth), value.scale))
+    return {name: Pairs(*np.array(rows).T) for name, rows in found.items()}
+
+
+def side_by_side(answers: Mapping[str, Answer]) -> Sequence[str]:
+    """Return one line per unknown, with the answers of all simulators: ``friction angle of sand 31.2° (90 %: 30.1–32.4), solver 31°``."""
+    first, *others = answers.values()
+    lines = []
+    for value in first.values:
+        parts = [f"{value.label} {value.text}" + ("" if first.num_calibration else " [interval not calibrated]")]
+        parts += [f"{other.simulator} {other[value.name].short}" for other in others]
+        notes = [
+            f"{answer.simulator} at the {answer[value.name].at_bound} bound" for answer in answers.values() if answer[value.name].at_bound
+        ]
+        lines.append(", ".join(parts) + (f"; {', '.join(notes)}" if notes else ""))
+    return lines

@@ -1,0 +1,164 @@
+"""Results folder of many scenes: a file and pictures per scene, and a table of all. Scenes that have an answer are not computed again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import torch
+
+from gpe_pl.files.atomic import replace_text
+from gpe_pl.files.markdown import table_row
+from gpe_pl.identification.answer import FOLDER, MODEL, SOLVER, Answer, answer_path, read_answer, read_answers, side_by_side
+from gpe_pl.identification.calibration import Calibration
+from gpe_pl.identification.observations import Observations, ObservationSettings
+from gpe_pl.identification.pictures import misfit_figure
+from gpe_pl.identification.scene import SolverError, identify, solver_bounds, solver_of, trained_bounds
+from gpe_pl.identification.search import SearchSettings
+from gpe_pl.identification.shooting import ShootingSettings
+from gpe_pl.identification.unknowns import Bounds, Unknowns, unknowns_of
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics.conformal import interval_score
+from gpe_pl.rollout.loop import Simulator, rollout
+from gpe_pl.system.progress import progress_bar
+from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.viz.figures import rollout_figure
+from gpe_pl.viz.saving import save_figure
+
+SHOWN_FRAMES = 60
+"""Largest number of frames of the picture of observed and fitted motion."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What to identify in each scene, and how.
+
+    Attributes:
+        model: trained model, which also gives the bounds.
+        unknowns, per_body, bounds: as in ``identify``.
+        simulators: ``model``, ``solver``, or both.
+        observations, shooting, search: settings.
+        calibrations: calibration by simulator and name of the unknown.
+    """
+
+    model: LearnedSimulator
+    unknowns: Sequence[str] | None
+    per_body: bool
+    bounds: Bounds
+    simulators: Sequence[str]
+    observations: ObservationSettings
+    shooting: ShootingSettings
+    search: SearchSettings
+    calibrations: Mapping[str, Mapping[str, Calibration]]
+
+    def run(self, name: str, trajectory: Trajectory, folder: Path) -> Iterator[str]:
+        """Identify one scene, write the answers and pictures into a folder, and yield lines for readers."""
+        self.model.check_scene(trajectory.metadata)
+        observed = Observations.of(trajectory, self.observations)
+        bounds = {**solver_bounds(trajectory.metadata), **trained_bounds(self.model), **self.bounds}
+        answers: dict[str, Answer] = {}
+        is_new = False
+        for kind in self.simulators:
+            path = answer_path(folder, name, kind)
+            if not path.exists():
+                try:
+                    simulator = self.model if kind == MODEL else solver_of(trajectory.metadata)
+                except SolverError as error:
+                    if len(self.simulators) == 1:
+                        raise
+                    yield str(error)
+                    continue
+                with progress_bar(f"{name} {kind}") as on_progress:
+                    answer = identify(
+                        simulator, observed, self.unknowns, per_body=self.per_body, bounds=bounds, shooting_settings=self.shooting,
+                        search_settings=self.search, calibration=self.calibrations.get(kind), scene=name, on_progress=on_progress,
+                    )  # fmt: skip
+                answer.write(folder)
+                is_new = True
+            answers[kind] = read_answer(path)
+        sought = unknowns_of(trajectory, self.unknowns, bounds, self.per_body)
+        if is_new:
+            save_figure(misfit_figure(answers), folder / FOLDER / f"{name}_misfit.png", dpi=110)
+            save_figure(self._motion(trajectory, sought, answers), folder / FOLDER / f"{name}_motion.png", dpi=110)
+        yield from side_by_side(answers)
+        yield from (f"{kind}: {answer.gradients}" for kind, answer in answers.items() if answer.gradients)
+
+    def _motion(self, trajectory: Trajectory, sought: Unknowns, answers: Mapping[str, Answer]) -> object:
+        """Return a figure of the observed motion beside rollouts with the answers."""
+        first = 0 if sought.needs_start else self.model.builder.config.history
+        number = min(SHOWN_FRAMES, trajectory.num_frames - 1 - first)
+        shown: dict[str, Trajectory] = {}
+        for kind, answer in answers.items():
+            z = np.array([(u.coordinate(v.raw) - u.coordinate(u.low)) / u.range for u, v in zip(sought.items, answer.values, strict=True)])
+            simulator: Simulator = self.model if kind == MODEL else solver_of(trajectory.metadata)
+            if kind == MODEL:
+                model = self.model.configured(clamps_parameters=False)
+                start = trajectory.state(0) if sought.needs_start else None
+                state = model.initial_state(trajectory, first) if start is None else model.standing(start, trajectory.metadata)
+                shown[kind] = rollout(model, sought.applied(state, torch.from_numpy(z)), number, trajectory.metadata)
+            else:
+                run = rollout(simulator, sought.applied(trajectory.state(0), z), first + number, trajectory.metadata)
+                shown[kind] = replace(run, is_prediction=True).frames(first, run.num_frames)
+        return rollout_figure(trajectory.frames(first, first + number + 1), shown)
+
+
+def write_table(folder: Path) -> str:
+    """Write ``table.md`` with the answers of all scenes and their errors, and return the summary."""
+    answers = {kind: read_answers(folder, kind) for kind in (MODEL, SOLVER)}
+    rows = [
+        table_row(["scene", "simulator", "unknown", "answer", "stored value", "bound", "rollouts", "processor seconds"]),
+        "|" + "---|" * 8,
+    ]
+    for kind, own in answers.items():
+        for answer in own:
+            for value in answer.values:
+                truth = "" if value.truth is None else f"{value.truth:.4g}"
+                cells = [answer.scene, kind, value.label, value.text, truth, value.at_bound, str(answer.num_evaluations)]
+                rows.append(table_row([*cells, f"{answer.processor_seconds:.1f}"]))
+    summary = _summary(answers)
+    replace_text(folder / "table.md", "\n".join([*summary, "", *rows, ""]))
+    return "\n".join(summary)
+
+
+def _summary(answers: Mapping[str, list[Answer]]) -> list[str]:
+    """Return a table of errors per unknown and simulator, over scenes with a stored value."""
+    head = [
+        "unknown",
+        "simulator",
+        "scenes",
+        "median error",
+        "median relative error",
+        "bias",
+        "coverage",
+        "interval score",
+        "median processor seconds",
+    ]
+    lines = [table_row(head), "|" + "---|" * len(head)]
+    for kind, own in answers.items():
+        names = dict.fromkeys(value.name.partition("#")[0] for answer in own for value in answer.values)
+        for name in names:
+            known = [(v, a) for a in own for v in a.values if v.name.partition("#")[0] == name and v.truth is not None]
+            if not known:
+                continue
+            error = np.array([v.estimate - (v.truth or 0.0) for v, _ in known])
+            truth, low, high = (np.array([getattr(v, key) for v, _ in known], dtype=float) for key in ("truth", "low", "high"))
+            is_log = known[0][0].is_log
+            a, b, x = (np.log(values) if is_log else values for values in (low, high, truth))
+            level = known[0][1].level
+            covered = (
+                "not calibrated"
+                if not known[0][1].num_calibration
+                else f"{np.mean((low <= truth) & (truth <= high)):.0%} of nominal {level:.0%}"
+            )
+            score = f"{interval_score(a, b, x, level).mean():.3g}" + (" (logarithm)" if is_log else "")
+            relative = f"{median(np.abs(error) / np.abs(truth)):.1%}" if (truth != 0).all() else ""
+            seconds = f"{median(a.processor_seconds for _, a in known):.1f}"
+            lines.append(
+                table_row(
+                    [name, kind, str(len(known)), f"{median(np.abs(error)):.3g}", relative, f"{error.mean():.3g}", covered, score, seconds]
+                )
+            )
+    return lines if len(lines) > 2 else ["no scene has a stored value to compare with"]

@@ -1,0 +1,239 @@
+"""Unknowns of a scene: material parameters, an initial velocity, the direction of gravity. Optimisers see each as a number from 0 to 1 between its bounds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from array_api_compat import array_namespace
+from scipy.spatial import cKDTree
+
+from gpe_pl.errors import GpeError
+from gpe_pl.schema import MATERIALS, node_code
+from gpe_pl.trajectory.cells import bodies, components
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.viz.captions import materials_of, parameter_name, parameter_value
+
+VELOCITY: Literal["velocity"] = "velocity"
+GRAVITY: Literal["gravity"] = "gravity"
+"""Names of unknowns that are no material parameters."""
+BODY_SPACINGS = 1.5
+"""Nodes without cells belong to one body if they are nearer than this in the first frame [spacings]."""
+STEEPEST = 45.0
+"""Largest angle between the sought direction of gravity and the stored one [deg]."""
+AT_BOUND = 0.01
+"""Answers nearer to a bound than this fraction of the range count as lying at the bound."""
+
+Bounds = Mapping[str, tuple[float, float]]
+"""Lowest and highest value of unknowns, by name ``MATERIAL.PARAMETER``."""
+
+
+class UnknownError(GpeError, ValueError):
+    """Raised for an unknown that a scene does not have."""
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One number that is sought.
+
+    Attributes:
+        name: ``MATERIAL.PARAMETER``, ``velocity.x`` or ``gravity.x``; with ``#1`` and so on for the bodies of a scene.
+        label: name for readers.
+        unit: unit as in ``schema.MATERIALS``.
+        low, high: bounds.
+        is_log: whether steps are taken in the logarithm.
+        kind: what is replaced in a state.
+        place: column of ``material_params``, or axis of the velocity or of gravity.
+        nodes: rows of the nodes that have it.
+        truth: stored value; NaN if it is not one value.
+    """
+
+    name: str
+    label: str
+    unit: str
+    low: float
+    high: float
+    is_log: bool
+    kind: Literal["parameter", "velocity", "gravity"]
+    place: int
+    nodes: np.ndarray
+    truth: float = math.nan
+
+    def coordinate(self, value: float) -> float:
+        """Return the coordinate in which errors and intervals are measured: the value, or its natural logarithm."""
+        return math.log(value) if self.is_log else value
+
+    def value(self, coordinate: float) -> float:
+        return math.exp(coordinate) if self.is_log else coordinate
+
+    @property
+    def range(self) -> float:
+        """Length of the range between the bounds, in coordinates."""
+        return self.coordinate(self.high) - self.coordinate(self.low)
+
+    def at(self, z: Any) -> Any:
+        """Return the value at a number from 0 to 1, or at a tensor of such numbers."""
+        coordinate = self.coordinate(self.low) + z * self.range
+        if not self.is_log:
+            return coordinate
+        return array_namespace(z).exp(coordinate) if hasattr(z, "shape") else math.exp(coordinate)
+
+    def bound_of(self, z: float) -> str:
+        """Return ``lower`` or ``upper`` if the answer lies at a bound, otherwise an empty text."""
+        return "lower" if z < AT_BOUND else "upper" if z > 1 - AT_BOUND else ""
+
+    def text(self, value: float) -> str:
+        """Return a value with its unit."""
+        parameter = next(
+            (p for own in MATERIALS.values() for p in own if self.kind == "parameter" and p.name == self.name_of_parameter), None
+        )
+        return f"{value:.3g} {self.unit}" if parameter is None else parameter_value(parameter, float(f"{value:.3g}"))
+
+    @property
+    def name_of_parameter(self) -> str:
+        return self.name.partition(".")[2].partition("#")[0]
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """The unknowns of a scene, in the order of the numbers from 0 to 1 that an optimiser changes."""
+
+    items: tuple[Unknown, ...]
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    @property
+    def needs_start(self) -> bool:
+        """Whether rollouts have to start at the first frame, because its velocity is sought."""
+        return any(u.kind == VELOCITY for u in self.items)
+
+    def applied(self, state: State, z: Any) -> State:
+        """Return a state with the values at ``z`` [unknown]; all arrays are of the same library. Gradients pass to ``z``."""
+        params, vel, gravity = 1 * state.material_params, 1 * state.vel, 1 * state.gravity
+        history = None if state.velocity_history is None else 1 * state.velocity_history
+        tilt = 0 * gravity
+        for k, unknown in enumerate(self.items):
+            value = unknown.at(z[k])
+            if unknown.kind == "parameter":
+                params[unknown.nodes, unknown.place] = value
+            elif unknown.kind == VELOCITY:
+                vel[unknown.nodes, unknown.place] = value
+                if history is not None:
+                    history[unknown.nodes, :, unknown.place] = value
+            else:
+                tilt[unknown.place] = array_namespace(z).tan(value * (math.pi / 180))
+        if any(u.kind == GRAVITY for u in self.items):
+            size = (gravity**2).sum() ** 0.5
+            gravity = gravity + size * tilt
+            gravity = gravity * (size / (gravity**2).sum() ** 0.5)
+        return replace(state, material_params=params, vel=vel, velocity_history=history, gravity=gravity)
+
+
+def unknowns_of(trajectory: Trajectory, wanted: Sequence[str] | None, ranges: Bounds, per_body: bool = False) -> Unknowns:
+    """Return the unknowns of a scene.
+
+    Args:
+        trajectory: the observed scene; its stored values become ``truth``.
+        wanted: names ``MATERIAL``, ``MATERIAL.PARAMETER``, ``velocity`` or ``gravity``; None takes all parameters of all materials of the scene.
+        ranges: bounds of material parameters by name ``MATERIAL.PARAMETER``.
+        per_body: give each body values of its own.
+
+    Raises:
+        UnknownError: the scene has no such unknown, or a parameter has no bounds. The message names it.
+    """
+    found: list[Unknown] = []
+    groups = scene_bodies(trajectory) if per_body else []
+    for name in materials_of(trajectory) if wanted is None else wanted:
+        material, _, parameter = name.partition(".")
+        if material == VELOCITY:
+            found += _velocities(trajectory, groups)
+        elif material == GRAVITY:
+            found += _gravity(trajectory)
+        else:
+            found += _parameters(trajectory, material, parameter, ranges, groups)
+    if not found:
+        raise UnknownError("unknowns=[]: name at least one, such as sand.friction_angle")
+    return Unknowns(tuple(found))
+
+
+def scene_bodies(trajectory: Trajectory) -> list[np.ndarray]:
+    """Return the nodes of each body in the first frame: connected by cells, or within ``BODY_SPACINGS`` and of one material."""
+    num_nodes = trajectory.num_nodes
+    meshes = [] if trajectory.cells is None else bodies(trajectory.cells, num_nodes)
+    free = np.setdiff1d(np.arange(num_nodes), np.concatenate([*meshes, np.zeros(0, dtype=np.int64)]).astype(np.int64))
+    if not len(free):
+        return meshes
+    pairs = cKDTree(trajectory.pos[0, free].astype(np.float64)).query_pairs(
+        BODY_SPACINGS * trajectory.metadata.spacing, output_type="ndarray"
+    )
+    kind = trajectory.node_type[free]
+    pairs = pairs[kind[pairs[:, 0]] == kind[pairs[:, 1]]].astype(np.int64)
+    number, label = components(pairs.T, len(free))
+    return [*meshes, *(free[label == k] for k in range(number))]
+
+
+def _grouped(rows: np.ndarray, groups: list[np.ndarray]) -> list[tuple[str, str, np.ndarray]]:
+    """Return name suffix, label suffix and nodes of each body among rows; one entry without suffix if there are no bodies."""
+    if not groups:
+        return [("", "", rows)]
+    own = [np.intersect1d(rows, group) for group in groups]
+    own = [nodes for nodes in own if len(nodes)]
+    return [(f"#{k}", f", body {k}", nodes) for k, nodes in enumerate(own, start=1)]
+
+
+def _parameters(trajectory: Trajectory, material: str, parameter: str, ranges: Bounds, groups: list[np.ndarray]) -> list[Unknown]:
+    metadata = trajectory.metadata
+    own = materials_of(trajectory)
+    if material not in own:
+        raise UnknownError(
+            f"unknowns: {material!r} is no material of the scene; it has {', '.join(own)}, and also {VELOCITY} and {GRAVITY}"
+        )
+    stored = dict(zip((p.name for p in metadata.parameters_of(material)), metadata.columns_of(material), strict=True))
+    if parameter and parameter not in stored:
+        raise UnknownError(f"unknowns: {material} has no stored parameter {parameter!r}; it has {', '.join(stored)}")
+    found, rows = [], np.flatnonzero(trajectory.node_type == node_code(material))
+    for spec in metadata.parameters_of(material):
+        name = f"{material}.{spec.name}"
+        if parameter not in ("", spec.name):
+            continue
+        if name not in ranges or not ranges[name][0] < ranges[name][1] < math.inf:
+            raise UnknownError(f"{name}: has no range in training; give one with bounds.{name}=[LOW,HIGH]")
+        for suffix, label, nodes in _grouped(rows, groups):
+            values = np.unique(trajectory.material_params[nodes, stored[spec.name]])
+            truth = float(values[0]) if len(values) == 1 else math.nan
+            found.append(
+                Unknown(
+                    name + suffix, f"{parameter_name(spec)} of {material}{label}", spec.unit, *ranges[name], spec.scale == "log",
+                    "parameter", stored[spec.name], nodes, truth,
+                )
+            )  # fmt: skip
+    return found
+
+
+def _velocities(trajectory: Trajectory, groups: list[np.ndarray]) -> list[Unknown]:
+    steps = np.abs(np.diff(trajectory.pos.astype(np.float64), axis=0)) / trajectory.metadata.frame_dt
+    fastest = 1.5 * float(np.quantile(steps.max(axis=(1, 2)), 0.95)) + 1e-6
+    return [
+        Unknown(f"{VELOCITY}.{axis}{suffix}", f"initial velocity {axis}{label}", "m/s", -fastest, fastest, False, VELOCITY, k, nodes, truth)
+        for suffix, label, nodes in _grouped(np.arange(trajectory.num_nodes), groups)
+        for k, axis in enumerate("xyz"[: trajectory.metadata.dim])
+        for truth in [float(trajectory.vel[0, nodes, k].mean())]
+    ]
+
+
+def _gravity(trajectory: Trajectory) -> list[Unknown]:
+    gravity = np.abs(np.asarray(trajectory.metadata.gravity))
+    if not gravity.any():
+        raise UnknownError(f"unknowns: {GRAVITY}: the scene has no gravity whose direction could be sought; leave it out")
+    return [
+        Unknown(
+            f"{GRAVITY}.{axis}", f"tilt of gravity to {axis}", "deg", -STEEPEST, STEEPEST, False, GRAVITY, k, np.zeros(0, np.int64), 0.0
+        )
+        for k, axis in enumerate("xyz"[: trajectory.metadata.dim])
+        if k != int(gravity.argmax())
+    ]

@@ -1,0 +1,141 @@
+"""Command ``python -m gpe_pl.identify checkpoint=… trajectory=…``: find material parameters from observed motion."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from gpe_pl.config.entry_point import ConfigError, construct, entry_point
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from gpe_pl.trajectory.trajectory import Trajectory
+
+
+@dataclass(frozen=True, config={"extra": "forbid"})
+class Settings:
+    """Settings of the command that do not belong to a part of it; ``conf/identify.yaml`` describes them."""
+
+    checkpoint: str
+    trajectory: str
+    num_scenes: Annotated[int, Field(ge=1)] | None = None
+    unknowns: list[str] | None = None
+    per_body: bool = False
+    bounds: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
+    simulator: Literal["model", "solver", "both"] = "both"
+    calibration: str | None = None
+    level: Annotated[float, Field(gt=0, lt=1)] = 0.9
+
+
+PARTS = ("paths", "trainer", "name", "observations", "shooting", "search")
+
+
+def identify_scenes(cfg: DictConfig) -> None:
+    """Identify the unknowns of each scene that has no answer yet, and write a table of all. Results go to ``{paths.runs}/{name}``."""
+    from gpe_pl.files.names import run_name
+    from gpe_pl.files.run_folder import claim, without_orphans
+    from gpe_pl.identification.observations import ObservationSettings
+    from gpe_pl.identification.results import Task, write_table
+    from gpe_pl.identification.search import SearchSettings
+    from gpe_pl.identification.shooting import ShootingSettings
+    from gpe_pl.learned.pretrained import names
+    from gpe_pl.learned.simulator import LearnedSimulator
+    from gpe_pl.system.locks import locked
+    from gpe_pl.system.provenance import recorded
+    from gpe_pl.training.run import TrainerSettings, set_up
+
+    if not isinstance(cfg.checkpoint, str):
+        raise ConfigError(
+            f"checkpoint={cfg.checkpoint!r}: name the folder of a run, a checkpoint, or a shipped model: {', '.join(names())}"
+        )
+    if not isinstance(cfg.trajectory, str):
+        raise ConfigError(
+            f"trajectory={cfg.trajectory!r}: name a file of trajectories, such as data/sand/tiny/test/shard-00000.h5, or a folder"
+        )
+    settings = construct(Settings, {key: value for key, value in _plain(cfg).items() if key not in PARTS}, "")
+    observations = construct(ObservationSettings, cfg.observations, "observations")
+    shooting, search = construct(ShootingSettings, cfg.shooting, "shooting"), construct(SearchSettings, cfg.search, "search")
+    simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint, set_up(construct(TrainerSettings, cfg.trainer, "trainer")))
+    folder = Path(cfg.paths.runs) / run_name(cfg.name)
+    task = Task(
+        simulator,
+        settings.unknowns,
+        settings.per_body,
+        {f"{material}.{name}": bounds for material, own in settings.bounds.items() for name, bounds in own.items()},
+        ("model", "solver") if settings.simulator == "both" else (settings.simulator,),
+        observations,
+        shooting,
+        search,
+        _calibrations(settings),
+    )
+    with locked(folder), recorded(folder, "identify", sys.argv[1:], cfg.paths.runs):
+        claim(folder, _identity(cfg), results=["scenes/*"])
+        with without_orphans(folder):
+            for name, trajectory in scenes(Path(settings.trajectory), settings.num_scenes):
+                for line in task.run(name, trajectory, folder):
+                    print(f"{name}: {line}", flush=True)
+            print(write_table(folder))
+    print(folder)
+
+
+def scenes(path: Path, number: int | None) -> Iterator[tuple[str, Trajectory]]:
+    """Yield name and trajectory of each scene in a file, or in the files of a folder.
+
+    Raises:
+        ConfigError: there is no such file, or the folder has none.
+    """
+    from itertools import islice
+
+    from gpe_pl.trajectory.store import read_trajectory, trajectory_names
+
+    files = sorted(path.glob("*.h5")) if path.is_dir() else [path]
+    if not files or not files[0].is_file():
+        raise ConfigError(f"trajectory={path}: no file *.h5 there; name a file of stored trajectories, or the folder of a split")
+    named = ((file, name) for file in files for name in trajectory_names(file))
+    for file, name in islice(named, number):
+        yield f"{file.stem}_{name}", read_trajectory(file, name)
+
+
+def _calibrations(settings: Settings) -> dict[str, dict[str, Any]]:
+    """Return the calibration of each simulator and unknown from an earlier results folder; empty without one."""
+    from gpe_pl.identification.answer import MODEL, SOLVER, pairs_of, read_answers
+    from gpe_pl.identification.calibration import calibrated
+
+    if settings.calibration is None:
+        return {}
+    found = {}
+    for simulator in (MODEL, SOLVER):
+        pairs = pairs_of(read_answers(Path(settings.calibration), simulator))
+        found[simulator] = {name: calibrated(own, settings.level) for name, own in pairs.items()}
+    if not any(found.values()):
+        raise ConfigError(f"calibration={settings.calibration}: has no answers; name the results folder of an earlier run of this command")
+    return found
+
+
+def _plain(cfg: DictConfig) -> dict[str, Any]:
+    from omegaconf import OmegaConf
+
+    values: Any = OmegaConf.to_container(cfg, resolve=True)
+    return values
+
+
+def _identity(cfg: DictConfig) -> dict[str, Any]:
+    """Return the settings on which answers depend. If one differs, the run needs another folder."""
+    from gpe_pl.learned.pretrained import fingerprint
+
+    values = _plain(cfg)
+    kept = ("unknowns", "per_body", "bounds", "calibration", "level", "observations", "shooting", "search", "trajectory")
+    return {"checkpoint": fingerprint(cfg.checkpoint), **{key: values[key] for key in kept}}
+
+
+main = entry_point("identify")(identify_scenes)
+
+if __name__ == "__main__":
+    main()

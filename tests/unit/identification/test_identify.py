@@ -1,0 +1,263 @@
+"""Unknowns of a scene are found from its motion, also if parts of it are missing; intervals cover, and gradients are right or refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gpe_pl.identification.answer import Answer, pairs_of, read_answers, side_by_side
+from gpe_pl.identification.calibration import CalibrationError, Pairs, calibrated
+from gpe_pl.identification.gradient_check import GradientCheck, gradient_check
+from gpe_pl.identification.observations import ObservationError, Observations, ObservationSettings
+from gpe_pl.identification.scene import SolverError, identify, solver_of
+from gpe_pl.identification.search import SearchSettings
+from gpe_pl.identification.shooting import Checkpointed, Shooting, ShootingError, ShootingSettings, shooting
+from gpe_pl.identification.unknowns import UnknownError, unknowns_of
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics.conformal import interval_score
+from gpe_pl.models.gpe import GPE
+from gpe_pl.rollout.loop import SimulationError, rollout, step_scenes
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
+from tests import scenes
+from tests.unit.training.test_unroll_gradients import Double, simulator_of, slow, unroll
+
+DT, ANGLE = 0.01, 31.0
+BOUNDS = {"sand.friction_angle": (20.0, 42.5), "fluid.kinematic_viscosity": (1e-3, 1.0)}
+
+
+@dataclass(frozen=True)
+class Drag:
+    """A simulator in which the first material parameter slows nodes down: v' = g - rate · parameter · v. It can start anywhere."""
+
+    rate: float = 0.1
+    can_restart: bool = True
+
+    def restarted(self, state: State) -> State:
+        return state
+
+    def step(self, state: State) -> State:
+        column = np.nan_to_num(np.asarray(state.material_params, dtype=np.float64)).sum(axis=1, keepdims=True)
+        vel = (state.vel + DT * np.asarray(state.gravity)) / (1 + DT * self.rate * column)
+        return state.later(DT, state.pos + DT * vel, vel)
+
+
+def thrown(values: float | np.ndarray = ANGLE, material: str = "sand", simulator: Drag | None = None, num_frames: int = 40) -> Trajectory:
+    """Return two bodies that fly under gravity and drag."""
+    grid = np.stack(np.meshgrid(np.arange(3), np.arange(3), indexing="ij"), axis=-1).reshape(-1, 2) * 0.1
+    pos = np.concatenate([grid, grid + np.array([1.0, 0.0])])
+    name = {"sand": "friction_angle", "fluid": "kinematic_viscosity"}[material]
+    still = Trajectory.from_numpy(
+        np.repeat(pos[None], 3, axis=0), DT, material, {material: {name: np.broadcast_to(values, 18).copy()}},
+        vel=np.broadcast_to([1.0, 0.5], (3, 18, 2)).copy(), bounds=[(-5, 5), (-5, 5)], gravity=[0.0, -9.81], spacing=0.1,
+    )  # fmt: skip
+    return rollout(simulator or Drag(), still.state(0), num_frames - 1, still.metadata)
+
+
+def test_a_parameter_is_found_whatever_is_stored() -> None:
+    seen = thrown()
+    hidden = replace(seen, material_params=np.full_like(seen.material_params, 25.0))
+    answer = identify(Drag(), hidden, bounds=BOUNDS)
+    assert answer["sand.friction_angle"].raw == pytest.approx(ANGLE, abs=0.1)
+    assert answer["sand.friction_angle"].truth == 25.0
+    assert answer.num_windows == 2
+    assert answer.method == "derivative_free"
+    assert "friction angle of sand 31" in str(answer)
+
+
+def test_logarithmic_parameters_are_found() -> None:
+    simulator = Drag(rate=20.0)
+    answer = identify(simulator, thrown(0.03, "fluid", simulator), bounds=BOUNDS)
+    assert answer.values[0].raw == pytest.approx(0.03, rel=0.02)
+
+
+def test_bodies_have_values_of_their_own() -> None:
+    values = np.repeat([24.0, 38.0], 9)
+    answer = identify(Drag(), thrown(values), per_body=True, bounds=BOUNDS, search_settings=SearchSettings(max_evaluations=100))
+    assert [value.raw for value in answer.values] == pytest.approx([24.0, 38.0], abs=0.5)
+    assert [value.truth for value in answer.values] == [24.0, 38.0]
+
+
+@pytest.mark.parametrize("wanted", [["sand", "velocity"], ["sand", "gravity"]])
+def test_motion_of_the_scene_is_found_too(wanted: list[str]) -> None:
+    settings = SearchSettings(max_evaluations=150)
+    seen = thrown()
+    if "gravity" in wanted:
+        down = np.array([math.tan(math.radians(10.0)), -1.0])
+        tilted = replace(seen.metadata, gravity=tuple(9.81 * down / np.linalg.norm(down)))
+        moved = rollout(Drag(), replace(seen.state(0), gravity=np.array(tilted.gravity)), 39, seen.metadata)
+        answer = identify(Drag(), moved, wanted, bounds=BOUNDS, search_settings=settings)
+        assert answer["gravity.x"].raw == pytest.approx(10.0, abs=1.0)
+    else:
+        answer = identify(Drag(), seen, wanted, bounds=BOUNDS, search_settings=settings)
+        assert [answer[f"velocity.{axis}"].raw for axis in "xy"] == pytest.approx([1.0, 0.5], abs=0.05)
+        assert answer.num_windows == 1
+    assert answer["sand.friction_angle"].raw == pytest.approx(ANGLE, abs=2.0)
+
+
+@pytest.mark.parametrize("settings", [{"nodes": 0.3}, {"every": 3}, {"added_noise": 3e-4}])
+def test_parts_of_the_motion_are_enough(settings: dict[str, float]) -> None:
+    observed = Observations.of(thrown(), ObservationSettings(**settings))  # type: ignore[arg-type]
+    answer = identify(Drag(), observed, bounds=BOUNDS)
+    assert answer["sand.friction_angle"].raw == pytest.approx(ANGLE, abs=3.0)
+    assert (answer.num_windows == 1) == ("nodes" in settings)
+
+
+def test_values_that_were_not_observed_are_not_used() -> None:
+    seen = thrown()
+    observed = Observations.of(seen, ObservationSettings(every=3))
+    wrong = np.where(observed.seen[..., None], seen.pos, np.float32(7.0))
+    assert np.abs(Observations(replace(seen, pos=wrong), observed.seen).completed.pos[:39] - seen.pos[:39]).max() < 1e-3
+
+
+def test_an_answer_at_a_bound_says_so() -> None:
+    answer = identify(Drag(), thrown(45.0), bounds=BOUNDS)
+    assert answer.values[0].at_bound == "upper"
+    assert "model at the upper bound" not in side_by_side({"solver": answer})[0]
+    assert "solver at the upper bound" in side_by_side({"solver": answer})[0]
+
+
+def test_rollouts_that_fail_do_not_win() -> None:
+    @dataclass(frozen=True)
+    class Fails(Drag):
+        def step(self, state: State) -> State:
+            if state.material_params[0, 0] < 30:
+                raise SimulationError("too soft")
+            return super().step(state)
+
+    assert identify(Fails(), thrown(32.0), bounds=BOUNDS).values[0].raw == pytest.approx(32.0, abs=0.2)
+
+
+def test_refusals() -> None:
+    seen = thrown()
+    with pytest.raises(UnknownError, match=r"'snow' is no material of the scene; it has sand"):
+        identify(Drag(), seen, ["snow"], bounds=BOUNDS)
+    with pytest.raises(UnknownError, match=r"no stored parameter 'cohesion'; it has friction_angle"):
+        identify(Drag(), seen, ["sand.cohesion"], bounds=BOUNDS)
+    with pytest.raises(UnknownError, match=r"give one with bounds\.sand\.friction_angle="):
+        identify(Drag(), seen)
+    with pytest.raises(ObservationError, match="fewer than 2 frames"):
+        Observations(seen, np.zeros(seen.pos.shape[:2], dtype=bool))
+    with pytest.raises(ShootingError, match="needs the start; choose simulator=model"):
+        identify(Drag(can_restart=False), replace(seen, start_time=1.0), bounds=BOUNDS)
+    with pytest.raises(ShootingError, match="solvers have no gradients"):
+        shooting(Drag(), Observations.of(seen), unknowns_of(seen, None, BOUNDS)).misfit_and_gradient([0.5])
+    with pytest.raises(SolverError, match="not from one that comes with the package"):
+        solver_of(seen.metadata)
+
+
+# --- gradients -----------------------------------------------------------------------------------------------------------------------------
+
+
+def learned(num_frames: int = 9) -> tuple[LearnedSimulator, Trajectory]:
+    """Return a small network in double precision, and one of its own rollouts."""
+    builder = scenes.builder(("sand",))
+    builder = Double(builder.config, builder.metadata)
+    state = slow(scenes.state(materials=("sand",)).to_torch())
+    simulator = simulator_of(GPE, builder, [unroll(builder, state, 1).graph], hidden_channels=8, num_message_passing_steps=1)
+    made = rollout(simulator, state, num_frames - 1, builder.metadata)
+    return simulator, replace(made, is_prediction=False)
+
+
+def gradients_of(simulator: LearnedSimulator, seen: Trajectory) -> Shooting:
+    unknowns = unknowns_of(seen, None, {"sand.friction_angle": (1.0, 60.0)})
+    return shooting(simulator, Observations.of(seen), unknowns, ShootingSettings(horizon=2, num_windows=2))
+
+
+def test_gradients_agree_with_finite_differences() -> None:
+    simulator, seen = learned()
+    shots = gradients_of(simulator, seen)
+    z, step = 0.7, 1e-4
+    value, gradient = shots.misfit_and_gradient([z])
+    difference = (shots.misfit([z + step]) - shots.misfit([z - step])) / (2 * step)
+    assert value == pytest.approx(shots.misfit([z]), rel=1e-9)
+    assert abs(difference) > 1e-6
+    assert gradient == pytest.approx([difference], rel=1e-2)
+
+
+def test_bounds_of_training_do_not_clamp() -> None:
+    simulator, seen = learned()
+    simulator.get_buffer("trained_sand").copy_(torch.tensor([[30.0], [31.0]]))
+    assert gradients_of(simulator, seen).misfit_and_gradient([0.9])[1][0] != 0
+
+
+def test_memory_does_not_grow_with_the_activations_of_a_horizon() -> None:
+    simulator, seen = learned()
+
+    def saved(advanced: LearnedSimulator | Checkpointed, num_steps: int) -> int:
+        sizes: list[int] = []
+
+        def pack(tensor: torch.Tensor) -> torch.Tensor:
+            sizes.append(tensor.numel())
+            return tensor
+
+        start = simulator.initial_state(seen, 5)
+        parameter = start.material_params.clone().requires_grad_()
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor), torch.enable_grad():
+            if isinstance(advanced, LearnedSimulator):
+                state = replace(start, material_params=parameter)
+                for _ in range(num_steps):
+                    (state,) = advanced.next_states([state])  # type: ignore[assignment]
+            else:
+                list(step_scenes(advanced, {0: replace(start, material_params=parameter)}, {0: num_steps}))
+        return sum(sizes)
+
+    assert saved(simulator, 3) > 1.5 * saved(simulator, 1) > 1000
+    assert saved(Checkpointed(simulator), 3) < 0.1 * saved(simulator, 3)
+
+
+def test_the_check_refuses_gradients_of_the_wrong_sign_or_size() -> None:
+    assert GradientCheck(1.0, 1.5).is_trusted
+    for wrong in (GradientCheck(-1.0, 1.0), GradientCheck(3.0, 1.0), GradientCheck(math.nan, 1.0), GradientCheck(1.0, 0.0)):
+        assert not wrong.is_trusted
+        assert "cannot be trusted" in str(wrong)
+
+
+def test_a_search_without_trusted_gradients_goes_on_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulator, seen = learned()
+    trusted = gradient_check(gradients_of(simulator, seen), [0.7])
+    settings = {"shooting_settings": ShootingSettings(horizon=2, num_windows=2), "bounds": {"sand.friction_angle": (1.0, 60.0)}}
+    search = SearchSettings(method="gradient", num_scanned=3, max_evaluations=6)
+    answer = identify(simulator, seen, search_settings=search, **settings)  # type: ignore[arg-type]
+    assert (answer.method == "gradient") == ("are trusted" in answer.gradients)
+    assert trusted.is_trusted
+    monkeypatch.setattr(GradientCheck, "is_trusted", False)
+    answer = identify(simulator, seen, search_settings=search, **settings)  # type: ignore[arg-type]
+    assert answer.method == "derivative_free"
+    assert "derivative-free search takes their place" in answer.gradients
+
+
+# --- calibration ---------------------------------------------------------------------------------------------------------------------------
+
+
+def biased(number: int, seed: int) -> Pairs:
+    """Return answers that are too low, with errors that follow their scale."""
+    rng = np.random.default_rng(seed)
+    truth, scale = rng.uniform(20, 40, number), rng.choice([0.2, 2.0], number)
+    return Pairs(0.8 * truth - 3 + scale * rng.normal(size=number), truth, scale)
+
+
+def test_calibration_corrects_and_covers() -> None:
+    known, new = calibrated(biased(200, 0)), biased(1000, 1)
+    center, low, high = np.array([known.interval(e, s) for e, s in zip(new.estimate, new.scale, strict=True)]).T
+    assert np.abs(np.mean(center - new.truth)) < 0.3
+    assert 0.84 < np.mean((low <= new.truth) & (new.truth <= high)) < 0.96
+    constant = calibrated(biased(200, 0), adapts=False)
+    _, lowest, highest = np.array([constant.interval(e, 1.0) for e in new.estimate]).T
+    assert interval_score(low, high, new.truth, 0.9).mean() < interval_score(lowest, highest, new.truth, 0.9).mean()
+    with pytest.raises(CalibrationError, match="8 calibration scenes; .* at least 9"):
+        calibrated(biased(8, 0))
+
+
+def test_answers_are_read_as_they_were_written(tmp_path: Path) -> None:
+    answer: Answer = identify(Drag(), thrown(), bounds=BOUNDS, scene="first")
+    answer.write(tmp_path)
+    assert read_answers(tmp_path, "solver") == [answer]
+    pairs = pairs_of([answer, answer])["sand.friction_angle"]
+    assert pairs.truth.tolist() == [ANGLE, ANGLE]
+    assert pairs.estimate[0] == answer.values[0].raw
