@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -28,7 +27,7 @@ class Settings:
     num_scenes: Annotated[int, Field(ge=1)] | None = None
     unknowns: list[str] | None = None
     per_body: bool = False
-    bounds: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
+    bounds: dict[str, tuple[float, float]] | None = None
     simulator: Literal["model", "solver", "both"] = "both"
     calibration: str | None = None
     level: Annotated[float, Field(gt=0, lt=1)] = 0.9
@@ -68,7 +67,7 @@ def identify_scenes(cfg: DictConfig) -> None:
         simulator,
         settings.unknowns,
         settings.per_body,
-        {f"{material}.{name}": bounds for material, own in settings.bounds.items() for name, bounds in own.items()},
+        settings.bounds or {},
         ("model", "solver") if settings.simulator == "both" else (settings.simulator,),
         observations,
         shooting,

@@ -57,6 +57,15 @@ class Calibration:
         return center, center - half, center + half
 
 
+def intervals_without_own(pairs: Pairs, level: float = 0.9, adapts: bool = True) -> Float64[np.ndarray, "scene 3"]:
+    """Return the corrected answer of each scene and the ends of its interval, calibrated on all other scenes; the arguments are those of ``calibrated``."""
+    found = []
+    for k, (estimate, _, scale) in enumerate(zip(*pairs, strict=True)):
+        others = Pairs(*(np.delete(values, k) for values in pairs))
+        found.append(calibrated(others, level, adapts).interval(float(estimate), float(scale) if adapts else 1.0))
+    return np.array(found)
+
+
 def calibrated(pairs: Pairs, level: float = 0.9, adapts: bool = True) -> Calibration:
     """Return the calibration from scenes with known truth.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,11 +10,23 @@ from statistics import median
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
-from gpe_pl.identification.answer import FOLDER, MODEL, SOLVER, Answer, answer_path, read_answer, read_answers, side_by_side
-from gpe_pl.identification.calibration import Calibration
+from gpe_pl.identification.answer import (
+    FOLDER,
+    MODEL,
+    SOLVER,
+    Answer,
+    Value,
+    answer_path,
+    pairs_of,
+    read_answer,
+    read_answers,
+    side_by_side,
+)
+from gpe_pl.identification.calibration import Calibration, intervals_without_own
 from gpe_pl.identification.observations import Observations, ObservationSettings
 from gpe_pl.identification.pictures import misfit_figure
 from gpe_pl.identification.scene import SolverError, identify, solver_bounds, solver_of, trained_bounds
@@ -21,7 +34,7 @@ from gpe_pl.identification.search import SearchSettings
 from gpe_pl.identification.shooting import ShootingSettings
 from gpe_pl.identification.unknowns import Bounds, Unknowns, unknowns_of
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.metrics.conformal import interval_score
+from gpe_pl.metrics.conformal import coverage, fewest_scenes, interval_score
 from gpe_pl.rollout.loop import Simulator, rollout
 from gpe_pl.system.progress import progress_bar
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -86,7 +99,7 @@ class Task:
         yield from side_by_side(answers)
         yield from (f"{kind}: {answer.gradients}" for kind, answer in answers.items() if answer.gradients)
 
-    def _motion(self, trajectory: Trajectory, sought: Unknowns, answers: Mapping[str, Answer]) -> object:
+    def _motion(self, trajectory: Trajectory, sought: Unknowns, answers: Mapping[str, Answer]) -> Figure:
         """Return a figure of the observed motion beside rollouts with the answers."""
         first = 0 if sought.needs_start else self.model.builder.config.history
         number = min(SHOWN_FRAMES, trajectory.num_frames - 1 - first)
@@ -123,42 +136,55 @@ def write_table(folder: Path) -> str:
     return "\n".join(summary)
 
 
+HEAD = (
+    "unknown",
+    "simulator",
+    "calibration",
+    "scenes",
+    "median error",
+    "median relative error",
+    "bias",
+    "coverage",
+    "interval score",
+    "processor seconds",
+)
+
+
 def _summary(answers: Mapping[str, list[Answer]]) -> list[str]:
-    """Return a table of errors per unknown and simulator, over scenes with a stored value."""
-    head = [
-        "unknown",
-        "simulator",
-        "scenes",
-        "median error",
-        "median relative error",
-        "bias",
-        "coverage",
-        "interval score",
-        "median processor seconds",
-    ]
-    lines = [table_row(head), "|" + "---|" * len(head)]
+    """Return a table of errors per unknown and simulator, over scenes with a stored value.
+
+    If a run without calibration has enough scenes, further rows show what a calibration would give: each scene's answer is calibrated on the other scenes, with
+    intervals that follow its scale, and with intervals of one width.
+    """
+    lines = [table_row([*HEAD]), "|" + "---|" * len(HEAD)]
     for kind, own in answers.items():
-        names = dict.fromkeys(value.name.partition("#")[0] for answer in own for value in answer.values)
-        for name in names:
-            known = [(v, a) for a in own for v in a.values if v.name.partition("#")[0] == name and v.truth is not None]
-            if not known:
-                continue
-            error = np.array([v.estimate - (v.truth or 0.0) for v, _ in known])
-            truth, low, high = (np.array([getattr(v, key) for v, _ in known], dtype=float) for key in ("truth", "low", "high"))
-            is_log = known[0][0].is_log
-            a, b, x = (np.log(values) if is_log else values for values in (low, high, truth))
-            level = known[0][1].level
-            covered = (
-                "not calibrated"
-                if not known[0][1].num_calibration
-                else f"{np.mean((low <= truth) & (truth <= high)):.0%} of nominal {level:.0%}"
-            )
-            score = f"{interval_score(a, b, x, level).mean():.3g}" + (" (logarithm)" if is_log else "")
-            relative = f"{median(np.abs(error) / np.abs(truth)):.1%}" if (truth != 0).all() else ""
-            seconds = f"{median(a.processor_seconds for _, a in known):.1f}"
-            lines.append(
-                table_row(
-                    [name, kind, str(len(known)), f"{median(np.abs(error)):.3g}", relative, f"{error.mean():.3g}", covered, score, seconds]
+        for name, pairs in pairs_of(own).items():
+            known = [
+                (answer, value)
+                for answer in own
+                for value in answer.values
+                if value.name.partition("#")[0] == name and value.truth is not None
+            ]
+            values, level, is_calibrated = [value for _, value in known], known[0][0].level, known[0][0].num_calibration > 0
+            change = math.log if values[0].is_log else float
+            given = np.array([[change(end) for end in (v.estimate, v.low, v.high)] for v in values])
+            rows = {"earlier run" if is_calibrated else "none": given}
+            if not is_calibrated and len(values) > max(4, fewest_scenes(level)):
+                rows["other scenes"] = intervals_without_own(pairs, level)
+                rows["other scenes, one width"] = intervals_without_own(pairs, level, adapts=False)
+            seconds = f"{median(answer.processor_seconds for answer, _ in known):.1f}"
+            for calibration, found in rows.items():
+                lines.append(
+                    table_row([name, kind, calibration, str(len(values)), *_numbers(found, pairs.truth, values[0], level), seconds])
                 )
-            )
     return lines if len(lines) > 2 else ["no scene has a stored value to compare with"]
+
+
+def _numbers(found: np.ndarray, truth: np.ndarray, value: Value, level: float) -> list[str]:
+    """Return errors, coverage and interval score of answers and interval ends [scene, 3] in coordinates, as cells of the table."""
+    estimate, low, high = found.T
+    plain = np.exp if value.is_log else np.asarray
+    error = plain(estimate) - plain(truth)
+    relative = f"{np.median(np.abs(error / plain(truth))):.1%}" if (plain(truth) != 0).all() else ""
+    score = f"{interval_score(low, high, truth, level).mean():.3g}" + (" (logarithm)" if value.is_log else "")
+    return [f"{np.median(np.abs(error)):.3g}", relative, f"{error.mean():.3g}", f"{coverage(low, high, truth):.0%} of {level:.0%}", score]

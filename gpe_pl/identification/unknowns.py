@@ -202,7 +202,7 @@ def _parameters(trajectory: Trajectory, material: str, parameter: str, ranges: B
         if parameter not in ("", spec.name):
             continue
         if name not in ranges or not ranges[name][0] < ranges[name][1] < math.inf:
-            raise UnknownError(f"{name}: has no range in training; give one with bounds.{name}=[LOW,HIGH]")
+            raise UnknownError(f"{name}: has no range in training; give one with bounds='{{{name}:[LOW,HIGH]}}'")
         for suffix, label, nodes in _grouped(rows, groups):
             values = np.unique(trajectory.material_params[nodes, stored[spec.name]])
             truth = float(values[0]) if len(values) == 1 else math.nan

@@ -14,6 +14,7 @@ from gpe_pl.identification.answer import Answer, pairs_of, read_answers, side_by
 from gpe_pl.identification.calibration import CalibrationError, Pairs, calibrated
 from gpe_pl.identification.gradient_check import GradientCheck, gradient_check
 from gpe_pl.identification.observations import ObservationError, Observations, ObservationSettings
+from gpe_pl.identification.results import Task, write_table
 from gpe_pl.identification.scene import SolverError, identify, solver_of
 from gpe_pl.identification.search import SearchSettings
 from gpe_pl.identification.shooting import Checkpointed, Shooting, ShootingError, ShootingSettings, shooting
@@ -139,7 +140,7 @@ def test_refusals() -> None:
         identify(Drag(), seen, ["snow"], bounds=BOUNDS)
     with pytest.raises(UnknownError, match=r"no stored parameter 'cohesion'; it has friction_angle"):
         identify(Drag(), seen, ["sand.cohesion"], bounds=BOUNDS)
-    with pytest.raises(UnknownError, match=r"give one with bounds\.sand\.friction_angle="):
+    with pytest.raises(UnknownError, match=r"give one with bounds='\{sand\.friction_angle:\[LOW,HIGH\]\}'"):
         identify(Drag(), seen)
     with pytest.raises(ObservationError, match="fewer than 2 frames"):
         Observations(seen, np.zeros(seen.pos.shape[:2], dtype=bool))
@@ -261,3 +262,32 @@ def test_answers_are_read_as_they_were_written(tmp_path: Path) -> None:
     pairs = pairs_of([answer, answer])["sand.friction_angle"]
     assert pairs.truth.tolist() == [ANGLE, ANGLE]
     assert pairs.estimate[0] == answer.values[0].raw
+
+
+def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, seen = learned()
+    seen = replace(seen, material_params=np.full_like(seen.material_params, 30.0))
+    monkeypatch.setattr("gpe_pl.identification.results.solver_of", lambda _: Drag())
+    bounds = {"sand.friction_angle": (1.0, 60.0)}
+    few, short = SearchSettings(num_scanned=3, max_evaluations=1), ShootingSettings(horizon=2, num_windows=1)
+    task = Task(model, None, False, bounds, ("model", "solver"), ObservationSettings(), short, few, {})
+    (line,) = task.run("first", seen, tmp_path)
+    assert line.startswith("friction angle of sand ")
+    assert ", solver " in line
+    assert {path.name for path in (tmp_path / "scenes").glob("*.png")} == {"first_misfit.png", "first_motion.png"}
+    before = read_answers(tmp_path, "model")
+    monkeypatch.setattr("gpe_pl.identification.results.identify", None)
+    assert [*task.run("first", seen, tmp_path)] == [line]
+    assert read_answers(tmp_path, "model") == before
+    assert "sand.friction_angle | model | none | 1 |" in write_table(tmp_path)
+
+
+def test_the_table_says_what_calibration_gives(tmp_path: Path) -> None:
+    for k, angle in enumerate(np.linspace(24, 38, 11)):
+        answer = identify(Drag(rate=0.11), thrown(angle), bounds=BOUNDS, scene=f"{k:02d}")  # all answers are too low by a tenth
+        answer.write(tmp_path)
+    rows = [line.strip("| ").split(" | ") for line in write_table(tmp_path).splitlines()[2:]]
+    assert [row[2] for row in rows] == ["none", "other scenes", "other scenes, one width"]
+    errors = [float(row[4]) for row in rows]
+    assert errors[0] > 2 > 0.2 > max(errors[1:])
+    assert len((tmp_path / "table.md").read_text().splitlines()) == 5 + 1 + 2 + 11
