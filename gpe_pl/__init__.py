@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from gpe_pl.data.ground_truth import generate_trajectory as generate_trajectory
     from gpe_pl.data.importers.assemble import save_dataset as save_dataset
     from gpe_pl.errors import GpeError as GpeError
+    from gpe_pl.evaluation.identification.scene import identify as identify
     from gpe_pl.export.program import export_model as export_model
     from gpe_pl.export.trajectories import write_npz as write_npz
     from gpe_pl.export.trajectories import write_vtk as write_vtk
     from gpe_pl.geometry.shapes import domain_walls as domain_walls
-    from gpe_pl.identification.scene import identify as identify
     from gpe_pl.learned.banded import roll_out_with_bands as roll_out_with_bands
     from gpe_pl.learned.bands import read as read_bands  # noqa: F401
     from gpe_pl.learned.ensemble import LearnedEnsemble as LearnedEnsemble
@@ -67,7 +67,7 @@ _MODULES = {
     "domain_walls": "geometry.shapes",
     "export_model": "export.program",
     "generate_trajectory": "data.ground_truth",
-    "identify": "identification.scene",
+    "identify": "evaluation.identification.scene",
     "iter_trajectories": "trajectory.store",
     "read_bands": "learned.bands",
     "read_trajectory": "trajectory.store",

@@ -17,6 +17,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "simulate": ("simulate", "generate a data set with a solver"),
     "fit": ("fit", "train a model, evaluate it and write a report"),
     "evaluate": ("evaluate", "compare rollouts of a trained model with the ground truth"),
+    "identify": ("identify", "find material parameters from observed motion, with intervals"),
     "convert": ("convert", "import data of other projects, or your own arrays"),
     "benchmark": ("benchmark", "run a suite: times, acceptance, stress tests"),
 }

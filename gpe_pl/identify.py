@@ -38,12 +38,12 @@ PARTS = ("paths", "trainer", "name", "observations", "shooting", "search")
 
 def identify_scenes(cfg: DictConfig) -> None:
     """Identify the unknowns of each scene that has no answer yet, and write a table of all. Results go to ``{paths.runs}/{name}``."""
+    from gpe_pl.evaluation.identification.observations import ObservationSettings
+    from gpe_pl.evaluation.identification.results import Task, write_table
+    from gpe_pl.evaluation.identification.search import SearchSettings
+    from gpe_pl.evaluation.identification.shooting import ShootingSettings
     from gpe_pl.files.names import run_name
     from gpe_pl.files.run_folder import claim, without_orphans
-    from gpe_pl.identification.observations import ObservationSettings
-    from gpe_pl.identification.results import Task, write_table
-    from gpe_pl.identification.search import SearchSettings
-    from gpe_pl.identification.shooting import ShootingSettings
     from gpe_pl.learned.pretrained import names
     from gpe_pl.learned.simulator import LearnedSimulator
     from gpe_pl.system.locks import locked
@@ -104,8 +104,8 @@ def scenes(path: Path, number: int | None) -> Iterator[tuple[str, Trajectory]]:
 
 def _calibrations(settings: Settings) -> dict[str, dict[str, Any]]:
     """Return the calibration of each simulator and unknown from an earlier results folder; empty without one."""
-    from gpe_pl.identification.answer import MODEL, SOLVER, pairs_of, read_answers
-    from gpe_pl.identification.calibration import calibrated
+    from gpe_pl.evaluation.identification.answer import MODEL, SOLVER, pairs_of, read_answers
+    from gpe_pl.evaluation.identification.calibration import calibrated
 
     if settings.calibration is None:
         return {}

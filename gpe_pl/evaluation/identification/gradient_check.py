@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpe_pl.identification.shooting import Shooting
+from gpe_pl.evaluation.identification.shooting import Shooting
 
 STEP = 0.05
 """Step of the central difference, as a fraction of the range between the bounds. With smaller steps, jumps decide that come from neighbours found or lost."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from gpe_pl.identification.shooting import Shooting
+from gpe_pl.evaluation.identification.shooting import Shooting
 
 STEP = 0.04
 """Step of the differences, as a fraction of the range between the bounds."""

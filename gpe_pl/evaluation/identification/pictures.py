@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gpe_pl.identification.answer import Answer, Value
+from gpe_pl.evaluation.identification.answer import Answer, Value
 
 COLORS = {"model": "tab:blue", "solver": "tab:orange"}
 

@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 from gpe_pl.errors import GpeError
-from gpe_pl.identification.answer import MODEL, SOLVER, Answer, value_of
-from gpe_pl.identification.calibration import Calibration
-from gpe_pl.identification.observations import Observations
-from gpe_pl.identification.search import SearchSettings, search
-from gpe_pl.identification.shooting import ShootingSettings, shooting
-from gpe_pl.identification.spread import spread
-from gpe_pl.identification.unknowns import Bounds, unknowns_of
+from gpe_pl.evaluation.identification.answer import MODEL, SOLVER, Answer, value_of
+from gpe_pl.evaluation.identification.calibration import Calibration
+from gpe_pl.evaluation.identification.observations import Observations
+from gpe_pl.evaluation.identification.search import SearchSettings, search
+from gpe_pl.evaluation.identification.shooting import ShootingSettings, shooting
+from gpe_pl.evaluation.identification.spread import spread
+from gpe_pl.evaluation.identification.unknowns import Bounds, unknowns_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import Simulator
 from gpe_pl.schema import MATERIALS

@@ -19,8 +19,8 @@ from pydantic.dataclasses import dataclass as validated_dataclass
 from torch.utils.checkpoint import checkpoint
 
 from gpe_pl.errors import GpeError
-from gpe_pl.identification.observations import Observations
-from gpe_pl.identification.unknowns import Unknowns
+from gpe_pl.evaluation.identification.observations import Observations
+from gpe_pl.evaluation.identification.unknowns import Unknowns
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import Restartable, SimulationError, Simulator, step_scenes
 from gpe_pl.trajectory.state import State

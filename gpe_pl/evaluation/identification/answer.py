@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from gpe_pl.evaluation.identification.calibration import Calibration, Pairs
+from gpe_pl.evaluation.identification.unknowns import Unknown
 from gpe_pl.files import sealed
-from gpe_pl.identification.calibration import Calibration, Pairs
-from gpe_pl.identification.unknowns import Unknown
 
 ADVICE = "delete the file and identify the scene again"
 MODEL, SOLVER = "model", "solver"

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl.identification.answer import Answer, pairs_of, read_answers, side_by_side
-from gpe_pl.identification.calibration import CalibrationError, Pairs, calibrated
-from gpe_pl.identification.gradient_check import GradientCheck, gradient_check
-from gpe_pl.identification.observations import ObservationError, Observations, ObservationSettings
-from gpe_pl.identification.results import Task, write_table
-from gpe_pl.identification.scene import SolverError, identify, solver_of
-from gpe_pl.identification.search import SearchSettings
-from gpe_pl.identification.shooting import Checkpointed, Shooting, ShootingError, ShootingSettings, shooting
-from gpe_pl.identification.unknowns import UnknownError, unknowns_of
+from gpe_pl.evaluation.identification.answer import Answer, pairs_of, read_answers, side_by_side
+from gpe_pl.evaluation.identification.calibration import CalibrationError, Pairs, calibrated
+from gpe_pl.evaluation.identification.gradient_check import GradientCheck, gradient_check
+from gpe_pl.evaluation.identification.observations import ObservationError, Observations, ObservationSettings
+from gpe_pl.evaluation.identification.results import Task, write_table
+from gpe_pl.evaluation.identification.scene import SolverError, identify, solver_of
+from gpe_pl.evaluation.identification.search import SearchSettings
+from gpe_pl.evaluation.identification.shooting import Checkpointed, Shooting, ShootingError, ShootingSettings, shooting
+from gpe_pl.evaluation.identification.unknowns import UnknownError, unknowns_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.conformal import interval_score
 from gpe_pl.models.gpe import GPE
@@ -267,7 +267,7 @@ def test_answers_are_read_as_they_were_written(tmp_path: Path) -> None:
 def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model, seen = learned()
     seen = replace(seen, material_params=np.full_like(seen.material_params, 30.0))
-    monkeypatch.setattr("gpe_pl.identification.results.solver_of", lambda _: Drag())
+    monkeypatch.setattr("gpe_pl.evaluation.identification.results.solver_of", lambda _: Drag())
     bounds = {"sand.friction_angle": (1.0, 60.0)}
     few, short = SearchSettings(num_scanned=3, max_evaluations=1), ShootingSettings(horizon=2, num_windows=1)
     task = Task(model, None, False, bounds, ("model", "solver"), ObservationSettings(), short, few, {})
@@ -276,7 +276,7 @@ def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.Monke
     assert ", solver " in line
     assert {path.name for path in (tmp_path / "scenes").glob("*.png")} == {"first_misfit.png", "first_motion.png"}
     before = read_answers(tmp_path, "model")
-    monkeypatch.setattr("gpe_pl.identification.results.identify", None)
+    monkeypatch.setattr("gpe_pl.evaluation.identification.results.identify", None)
     assert [*task.run("first", seen, tmp_path)] == [line]
     assert read_answers(tmp_path, "model") == before
     assert "sand.friction_angle | model | none | 1 |" in write_table(tmp_path)

@@ -18,8 +18,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
 from scipy.optimize import minimize, minimize_scalar
 
-from gpe_pl.identification.gradient_check import GradientCheck, gradient_check
-from gpe_pl.identification.shooting import Shooting
+from gpe_pl.evaluation.identification.gradient_check import GradientCheck, gradient_check
+from gpe_pl.evaluation.identification.shooting import Shooting
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.system.progress import Progress
 

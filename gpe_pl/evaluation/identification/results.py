@@ -12,9 +12,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from gpe_pl.files.atomic import replace_text
-from gpe_pl.files.markdown import table_row
-from gpe_pl.identification.answer import (
+from gpe_pl.evaluation.identification.answer import (
     FOLDER,
     MODEL,
     SOLVER,
@@ -26,13 +24,15 @@ from gpe_pl.identification.answer import (
     read_answers,
     side_by_side,
 )
-from gpe_pl.identification.calibration import Calibration, intervals_without_own
-from gpe_pl.identification.observations import Observations, ObservationSettings
-from gpe_pl.identification.pictures import misfit_figure
-from gpe_pl.identification.scene import SolverError, identify, solver_bounds, solver_of, trained_bounds
-from gpe_pl.identification.search import SearchSettings
-from gpe_pl.identification.shooting import ShootingSettings
-from gpe_pl.identification.unknowns import Bounds, Unknowns, unknowns_of
+from gpe_pl.evaluation.identification.calibration import Calibration, intervals_without_own
+from gpe_pl.evaluation.identification.observations import Observations, ObservationSettings
+from gpe_pl.evaluation.identification.pictures import misfit_figure
+from gpe_pl.evaluation.identification.scene import SolverError, identify, solver_bounds, solver_of, trained_bounds
+from gpe_pl.evaluation.identification.search import SearchSettings
+from gpe_pl.evaluation.identification.shooting import ShootingSettings
+from gpe_pl.evaluation.identification.unknowns import Bounds, Unknowns, unknowns_of
+from gpe_pl.files.atomic import replace_text
+from gpe_pl.files.markdown import table_row
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.conformal import coverage, fewest_scenes, interval_score
 from gpe_pl.rollout.loop import Simulator, rollout
