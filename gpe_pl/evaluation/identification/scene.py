@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.identification.answer import MODEL, SOLVER, Answer, value_of
 from gpe_pl.evaluation.identification.calibration import Calibration
 from gpe_pl.evaluation.identification.observations import Observations
-from gpe_pl.evaluation.identification.search import SearchSettings, search
-from gpe_pl.evaluation.identification.shooting import ShootingSettings, shooting
+from gpe_pl.evaluation.identification.search import Found, SearchSettings, search
+from gpe_pl.evaluation.identification.shooting import Shooting, ShootingSettings, shooting
 from gpe_pl.evaluation.identification.spread import spread
 from gpe_pl.evaluation.identification.unknowns import Bounds, unknowns_of
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -67,20 +68,25 @@ def identify(
         UnknownError, ObservationError, ShootingError, SceneError: the scene does not fit; the message says why.
     """
     seen = observed if isinstance(observed, Observations) else Observations.of(observed)
-    is_learned, began, processor = isinstance(simulator, LearnedSimulator), time.monotonic(), time.process_time()
+    began, processor = time.monotonic(), time.process_time()
     ranges = {**(trained_bounds(simulator) if isinstance(simulator, LearnedSimulator) else {}), **(bounds or {})}
-    sought = unknowns_of(seen.trajectory, unknowns, ranges, per_body)
-    rollouts = shooting(simulator, seen, sought, shooting_settings)
+    rollouts = shooting(simulator, seen, unknowns_of(seen.trajectory, unknowns, ranges, per_body), shooting_settings)
     found = search(rollouts, search_settings, on_progress)
+    answer = _answer(scene, rollouts, found, calibration or {})
+    return replace(answer, seconds=round(time.monotonic() - began, 2), processor_seconds=round(time.process_time() - processor, 2))
+
+
+def _answer(scene: str, rollouts: Shooting, found: Found, calibration: Mapping[str, Calibration]) -> Answer:
+    """Return the answer of a search, without its times."""
+    sought = rollouts.unknowns.items
+    chosen = [calibration.get(unknown.name.partition("#")[0], Calibration()) for unknown in sought]
     scales = spread(rollouts, found.z)
-    known = calibration or {}
-    chosen = [known.get(unknown.name.partition("#")[0], Calibration()) for unknown in sought.items]
     return Answer(
         scene=scene,
-        simulator=MODEL if is_learned else SOLVER,
+        simulator=MODEL if isinstance(rollouts.simulator, LearnedSimulator) else SOLVER,
         values=tuple(
             value_of(u, float(u.at(z)), float(z), float(scale) * u.range, own)
-            for u, z, scale, own in zip(sought.items, found.z, scales, chosen, strict=True)
+            for u, z, scale, own in zip(sought, found.z, scales, chosen, strict=True)
         ),
         level=chosen[0].level,
         num_calibration=min(own.num_scenes for own in chosen),
@@ -91,9 +97,9 @@ def identify(
         length=rollouts.length,
         num_evaluations=rollouts.num_evaluations,
         num_gradients=rollouts.num_gradients,
-        seconds=round(time.monotonic() - began, 2),
-        processor_seconds=round(time.process_time() - processor, 2),
-        tried=tuple((*(float(u.at(float(v))) for u, v in zip(sought.items, z, strict=True)), misfit) for z, misfit in found.tried),
+        seconds=0.0,
+        processor_seconds=0.0,
+        tried=tuple((*(float(u.at(float(v))) for u, v in zip(sought, z, strict=True)), misfit) for z, misfit in found.tried),
     )
 
 
