@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch._utils import _unflatten_dense_tensors
 from torch.nn import functional
 
 from gpe_pl.nn import fused_processor_kernels as kernels
@@ -138,9 +139,8 @@ class _Tables:
         offsets = np.array(self.of_states)
         kernels.backward(*self.given, *self.edges, self.work, self.scratch, self.width, self.channels, offsets, result.numpy())
         tensors = [t for step in self.steps for t in step.tensors]
-        parts = result.split([t.numel() for t in tensors])
         of_states = [self._view(offset, n).clone() for offset, n in zip(self.of_states, self.sizes, strict=True)]
-        return of_states + [part.view_as(t) for part, t in zip(parts, tensors, strict=True)]
+        return [*of_states, *_unflatten_dense_tensors(result, tensors)]
 
     def _view(self, offset: int, rows: int) -> Tensor:
         return self.tensors[offset : offset + rows * self.width].view(rows, self.width)
@@ -250,7 +250,7 @@ class _FusedProcessor(torch.autograd.Function):
     def forward(ctx: Any, relations: list[Relation], steps: list[Step], eps: float, num_types: int, *tensors: Tensor) -> Any:
         ctx.relations, ctx.steps, ctx.eps, ctx.num_types = relations, steps, eps, num_types
         ctx.save_for_backward(*tensors)
-        own = [t.detach().contiguous() for t in tensors]
+        own = [*map(Tensor.contiguous, tensors)]
         ctx.tables = _Tables(relations, _given(steps, own[num_types:]), own[:num_types])
         return tuple(ctx.tables.forward(eps))  # copies: an output that its own node in autograd's graph holds would never be freed
 

@@ -11,13 +11,14 @@ This is the smallest change in the mass-weighted sense for which Σ m a and Σ m
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal, cast
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gpe_pl.nn.fused import works_on
+from gpe_pl.nn.fused import plain_gradients, works_on
 from gpe_pl.nn.island_momentum_kernels import remove_rigid_part, replace_rigid_part
 
 IslandMomentum = Literal["ignored", "linear", "angular"]
@@ -47,11 +48,17 @@ def conserve(
         rows = torch.arange(island.shape[0], device=island.device)
         return torch.where(is_free[island][:, None], _kept(acceleration, mass, pos, island, rows, is_free.shape[0], angular), acceleration)
     if _compiles(acceleration, mass, pos):
-        kept = acceleration.clone()
-        if bool(is_free.any()):
-            arrays = [t.detach().contiguous().numpy() for t in (mass, pos, island, is_free)]
-            remove_rigid_part(kept.detach().numpy(), *arrays, angular, SMALLEST_PRINCIPAL_FRACTION)
-        return kept
+        if not bool(is_free.any()):
+            return acceleration
+        arguments = acceleration, mass, pos, island, is_free, angular
+        if not torch.is_grad_enabled():
+            return _without_rigid_part(*arguments)
+        return cast(Tensor, _Conserved.apply(*arguments))  # type: ignore[no-untyped-call]
+    return _conserved(acceleration, mass, pos, island, is_free, angular)
+
+
+def _conserved(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, is_free: Tensor, angular: bool) -> Tensor:
+    """Do the same as ``conserve`` with PyTorch's operations."""
     rows = torch.nonzero(is_free[island]).flatten()
     if not len(rows):
         return acceleration
@@ -101,11 +108,18 @@ def moved_by_contacts(
         are_rigid: contacts move bodies as a whole. Otherwise they act at the nodes where they are.
         only_contacts: nodes of bodies have no acceleration besides contacts; for bodies that are not rigid.
     """
-    if _compiles(acceleration, forces, mass, pos):
-        moved = acceleration.clone()
-        arrays = [t.detach().contiguous().numpy() for t in (forces, mass, pos, body)]
-        replace_rigid_part(moved.detach().numpy(), *arrays, count, are_rigid, only_contacts, SMALLEST_PRINCIPAL_FRACTION)
-        return moved
+    arguments = acceleration, forces, mass, pos, body, count, are_rigid, only_contacts
+    if _compiles(acceleration, mass, pos) and _compiles(forces, mass, pos):
+        if not torch.is_grad_enabled():
+            return _with_contacts(*arguments)
+        return cast(Tensor, _MovedByContacts.apply(*arguments))  # type: ignore[no-untyped-call]
+    return _moved_by_contacts(*arguments)
+
+
+def _moved_by_contacts(
+    acceleration: Tensor, forces: Tensor, mass: Tensor, pos: Tensor, body: Tensor, count: int, are_rigid: bool, only_contacts: bool
+) -> Tensor:
+    """Do the same as ``moved_by_contacts`` with PyTorch's operations."""
     in_body = body >= 0
     groups = torch.where(in_body, body, count), count + 1
     if are_rigid:
@@ -115,9 +129,80 @@ def moved_by_contacts(
     return acceleration + torch.where(in_body[:, None], change, 0.0)
 
 
-def _compiles(*tensors: Tensor) -> bool:
-    """Tell whether ``island_momentum_kernels`` can be used in the present context."""
-    return not torch.is_grad_enabled() and works_on(*tensors)
+def _compiles(values: Tensor, mass: Tensor, pos: Tensor) -> bool:
+    """Tell whether ``island_momentum_kernels`` can be used in the present context. They have no gradients with respect to masses and positions."""
+    return works_on(values, mass, pos) and not (torch.is_grad_enabled() and (mass.requires_grad or pos.requires_grad))
+
+
+class _Conserved(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, acceleration: Tensor, *others: Any) -> Tensor:
+        ctx.save_for_backward(acceleration, *others[:-1])
+        ctx.angular = others[-1]
+        return _without_rigid_part(acceleration, *others)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
+        acceleration, mass, pos, island, is_free = ctx.saved_tensors
+        if torch.is_grad_enabled():
+
+            def plain(a: Tensor) -> tuple[Tensor]:
+                return (_conserved(a, mass, pos, island, is_free, ctx.angular),)
+
+            return *plain_gradients(plain, [acceleration], [grad]), *[None] * 5
+        return grad - _transposed(grad, mass, pos, island, is_free, ctx.angular), *[None] * 5
+
+
+class _MovedByContacts(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, acceleration: Tensor, forces: Tensor, mass: Tensor, pos: Tensor, body: Tensor, *settings: Any) -> Tensor:
+        ctx.save_for_backward(acceleration, forces, mass, pos, body)
+        ctx.settings = settings
+        return _with_contacts(acceleration, forces, mass, pos, body, *settings)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
+        acceleration, forces, mass, pos, body = ctx.saved_tensors
+        count, are_rigid, only_contacts = ctx.settings
+        nothing = [None] * 6
+        if torch.is_grad_enabled():
+
+            def plain(a: Tensor, f: Tensor) -> tuple[Tensor]:
+                return (_moved_by_contacts(a, f, mass, pos, body, count, are_rigid, only_contacts),)
+
+            return *plain_gradients(plain, [acceleration, forces], [grad]), *nothing
+        in_body = (body >= 0)[:, None]
+        if only_contacts and not are_rigid:
+            return torch.where(in_body, 0.0, grad), torch.where(in_body, grad, 0.0), *nothing
+        is_body = torch.ones(count + 1, dtype=torch.bool)
+        is_body[count] = False
+        rigid = _transposed(grad, mass, pos, torch.where(body >= 0, body, count), is_body, True)
+        return grad - rigid, rigid if are_rigid else torch.where(in_body, grad, 0.0), *nothing
+
+
+def _without_rigid_part(acceleration: Tensor, mass: Tensor, pos: Tensor, group: Tensor, is_wanted: Tensor, angular: bool) -> Tensor:
+    kept = acceleration.detach().clone(memory_format=torch.contiguous_format)
+    remove_rigid_part(kept.numpy(), *_arrays(mass, pos, group, is_wanted), angular, SMALLEST_PRINCIPAL_FRACTION)
+    return kept
+
+
+def _with_contacts(acceleration: Tensor, forces: Tensor, mass: Tensor, pos: Tensor, body: Tensor, *settings: Any) -> Tensor:
+    moved = acceleration.detach().clone(memory_format=torch.contiguous_format)
+    replace_rigid_part(moved.numpy(), *_arrays(forces, mass, pos, body), *settings, SMALLEST_PRINCIPAL_FRACTION)
+    return moved
+
+
+def _arrays(*tensors: Tensor) -> list[np.ndarray]:
+    return [t.detach().contiguous().numpy() for t in tensors]
+
+
+def _transposed(grad: Tensor, mass: Tensor, pos: Tensor, group: Tensor, is_wanted: Tensor, angular: bool) -> Tensor:
+    """Return the gradient [node, dim] of accelerations from that of their rigid part; zero in groups that are not wanted.
+
+    The rigid part R is a projection that is orthogonal in the product weighted by masses m. Therefore Rᵀ = m R m⁻¹.
+    """
+    scaled = grad / mass[:, None]
+    return (scaled - _without_rigid_part(scaled, mass, pos, group, is_wanted, angular)) * mass[:, None]
 
 
 def _kept(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, rows: Tensor, count: int, angular: bool) -> Tensor:

@@ -1,4 +1,4 @@
-"""Compiled loops of ``nn.island_momentum``: they remove the rigid part of the accelerations of groups of nodes, in rollouts on a CPU.
+"""Compiled loops of ``nn.island_momentum``: they remove the rigid part of the accelerations of groups of nodes, on a CPU.
 
 Sums are in double precision.
 """

@@ -132,3 +132,38 @@ def rigid_motions(pos: Tensor) -> Tensor:
             turn[:, i], turn[:, j] = r[:, j], -r[:, i]
             turns.append(turn.reshape(-1, 1))
     return torch.cat([shifts, *turns], dim=1)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("which", ["linear", "angular", "rigid", "local", "only contacts"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-3)])
+def test_compiled_gradients_equal_those_of_plain_operations(dim: int, which: str, dtype: torch.dtype, tolerance: float) -> None:
+    a, mass, pos, island = (t.to(dtype) if t.is_floating_point() else t for t in scene(dim, seed=2))
+    forces, weight = torch.randn(2, *a.shape, dtype=dtype, generator=torch.Generator().manual_seed(3))
+    body = torch.where(island == 1, -1, island)
+
+    def gradients(create_graph: bool = False) -> list[Tensor]:
+        inputs = [a.clone().requires_grad_(), forces.clone().requires_grad_()]
+        if which in ("linear", "angular"):
+            out = conserve(inputs[0], mass, pos, island, FREE, which == "angular") + 0 * inputs[1]
+        else:
+            out = moved_by_contacts(inputs[0], inputs[1], mass, pos, body, len(SIZES), which == "rigid", which == "only contacts")
+        loss = (weight * out**2).sum() / 2
+        found = torch.autograd.grad(loss, inputs, create_graph=create_graph)
+        if create_graph:
+            found = torch.autograd.grad(found[0].square().sum() + found[1].square().sum(), inputs)
+        return [out.detach(), *found]
+
+    for create_graph in (False, True):
+        found = gradients(create_graph)
+        with unfused():
+            expected = gradients(create_graph)
+        for ours, theirs in zip(found, expected, strict=True):
+            assert (ours - theirs).norm() <= tolerance * (1 + theirs.norm())
+
+
+def test_gradients_with_respect_to_positions_are_those_of_plain_operations() -> None:
+    a, mass, pos, island = scene(2)
+    pos.requires_grad_()
+    conserve(a, mass, pos, island, FREE, True).square().sum().backward()
+    assert pos.grad is not None and pos.grad.abs().max() > 0
