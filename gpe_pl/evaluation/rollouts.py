@@ -90,19 +90,13 @@ def evaluate(
     Raises:
         StartError: ``settings.start_time`` leaves too little history, or is between frames.
         SceneError: the data do not fit the simulator.
-        ExportError: a format in ``settings.export`` needs a package that is not installed.
-        PageError: ``settings.export`` has ``page``, which cannot compute the model.
+        ExportError, PageError: a format in ``settings.export`` cannot be written.
     """
     first = members_of(simulator)[0]
     frame_dt = first.builder.metadata.frame_dt
     start_frame = settings.first_frame(first.builder.config.history, frame_dt)
-    check_formats(settings.export, simulator)
-    simulator = configured(
-        simulator,
-        clamps_parameters=settings.clamp_parameters,
-        static_friction=settings.static_friction,
-        mirror_average=settings.mirror_average,
-    )
+    check_formats(settings, simulator)
+    simulator = _as_evaluated(simulator, settings)
     run_dir.mkdir(parents=True, exist_ok=True)
     predictor = Predictor(simulator, settings, label, controls, stride, start_frame, seconds=[])
     rows, films = list[Row](), list[Film]()
@@ -125,6 +119,16 @@ def evaluate(
     write_cost(run_dir, predictor.seconds, frame_dt)
     write_rows(run_dir / "metrics.csv", rows)
     return rows
+
+
+def _as_evaluated(simulator: LearnedSimulator | LearnedEnsemble, settings: EvaluationSettings) -> LearnedSimulator | LearnedEnsemble:
+    """Return the simulator with the settings of an evaluation."""
+    return configured(
+        simulator,
+        clamps_parameters=settings.clamp_parameters,
+        static_friction=settings.static_friction,
+        mirror_average=settings.mirror_average,
+    )
 
 
 def _draw(run_dir: Path, scene: PredictedScene, split: str, number: int, label: str, settings: EvaluationSettings) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ import numpy as np
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.material_controls import AtValue
 from gpe_pl.evaluation.metric_rows import LEARNED
-from gpe_pl.evaluation.settings import Export
+from gpe_pl.evaluation.settings import EvaluationSettings, Export
+from gpe_pl.export.onnx_network import export_network
 from gpe_pl.export.play_model import check
 from gpe_pl.export.play_page import Film, write_page
 from gpe_pl.export.program import export_model
@@ -18,6 +20,8 @@ from gpe_pl.learned.ensemble import LearnedEnsemble
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.saving import save_figure
+
+log = logging.getLogger(__name__)
 
 VIEWER_BYTES = 2**26
 """Maximum size of a viewer's arrays before compression [bytes]; the viewer of a longer rollout skips frames."""
@@ -27,19 +31,26 @@ class ExportError(GpeError):
     """Raised when a requested export cannot be written; the message says what is missing."""
 
 
-def check_formats(formats: list[Export], simulator: LearnedSimulator | LearnedEnsemble) -> None:
-    """Check, before any rollout, that the formats can be written.
+def check_formats(settings: EvaluationSettings, simulator: LearnedSimulator | LearnedEnsemble) -> None:
+    """Check, before any rollout, that the formats of ``settings.export`` can be written.
 
     Raises:
-        ExportError: a format needs a package that is not installed, or takes a single model and the simulator is an ensemble.
+        ExportError: a format needs a package that is not installed, needs scenes with pictures, or takes a single model and the simulator is an ensemble.
         PageError: a page cannot compute the simulator.
     """
-    single = [kind for kind in ("model", "page") if kind in formats]
+    formats = settings.export
+    single = [kind for kind in ("model", "onnx", "page") if kind in formats]
     if isinstance(simulator, LearnedEnsemble):
         if single:
             raise ExportError(f"evaluation.export: {single[0]} takes a single checkpoint; leave it out, or evaluate one checkpoint")
     elif "page" in formats:
         check(simulator)
+    if "onnx" in formats and not all(importlib.util.find_spec(name) for name in ("onnx", "onnxruntime", "onnxscript")):
+        raise ExportError("evaluation.export: onnx needs onnx, onnxruntime and onnxscript: `pip install 'gpe_pl[onnx]'`, or leave it out")
+    if "onnx" in formats and not settings.num_pictures:
+        raise ExportError(
+            "evaluation.export: onnx is compared with the model in the scenes with pictures; choose evaluation.num_pictures=1"
+        )
     if "mp4" in formats and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ExportError(
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
@@ -95,6 +106,12 @@ def write_models(run_dir: Path, simulator: LearnedSimulator, label: str, films: 
     """Write the simulator to ``run_dir`` in those of the ``formats`` that hold it. A page calls it ``label`` and shows the films."""
     if "model" in formats:
         export_model(simulator, run_dir / "model.pt2")
+    if "onnx" in formats:
+        first = simulator.builder.config.history
+        frames = [(film.trajectory, frame) for film in films for frame in (first, (first + film.trajectory.num_frames - 1) // 2)]
+        states = [simulator.initial_state(trajectory, frame) for trajectory, frame in frames]  # at the start bodies may touch nothing
+        largest = export_network(simulator, run_dir / "network.onnx", states)
+        log.info("one step of network.onnx differs from the model by at most %.2g m from %d states", largest, len(states))
     if "page" in formats:
         write_page(run_dir / "page", {label: simulator}, {label: films})
 

@@ -10,7 +10,7 @@ from pydantic import Field
 from gpe_pl.errors import GpeError
 from gpe_pl.schema import Split
 
-Export = Literal["vtk", "npz", "mp4", "model", "page"]
+Export = Literal["vtk", "npz", "mp4", "model", "onnx", "page"]
 
 
 class StartError(GpeError, ValueError):
@@ -36,7 +36,8 @@ class EvaluationSettings:
         material_controls: roll scenes with unseen parameters out with other parameters, too (see ``material_controls``).
         num_pictures: number of trajectories per split that get a figure, an animation and a viewer. With 0, no curve of errors is drawn, either.
         export: what to write for other programs: the trajectories with pictures as ``vtk`` series, ``npz`` and ``mp4``, the ``model`` (see
-            ``export.program``), and a ``page`` on which the model runs in a browser (see ``export.play_page``), with films of these trajectories.
+            ``export.program``), its network as ``onnx`` (see ``export.onnx_network``), and a ``page`` on which the model runs in a browser (see
+            ``export.play_page``), with films of these trajectories.
     """
 
     splits: Annotated[list[Split], Field(min_length=1)] = field(default_factory=lambda: ["test", "test_unseen"])
