@@ -46,6 +46,8 @@ FRONT = 0.98
 DAM_SECONDS, COLUMN_SECONDS, DROP_SECONDS = 0.4, 1.0, 1.0
 DAM_WIDTH = 0.25
 """Width of the column of water as a fraction of the domain. Its height is twice the width, as in the experiments."""
+NEAR_WALL = 0.9
+"""Fraction of the domain up to which fronts are compared."""
 HALF_WIDTH, ASPECTS = 6, (1, 2, 3)
 """Half width of columns of sand in spacings, and their ratios of height to half width."""
 DROP_RADIUS, DROP_HEIGHT = 4, 4
@@ -178,10 +180,13 @@ def _dam_break(candidate: Candidate, folder: Path) -> list[Curve]:
     trial = tried(candidate, value, _filled(spec, value, low, np.round(np.array(size) / spacing).astype(int)), DAM_SECONDS)
     curves = measured_fronts(folder / DAM_BREAK_FILE) if (folder / DAM_BREAK_FILE).is_file() else []
     gravity = abs(spec.scene.gravity[-1])
-    for series, trajectory in (("solver", trial.truth), ("model", trial.model)):
-        front = np.quantile(trajectory.pos[..., 0], FRONT, axis=1) + spacing / 2 - low[0]
-        curves.append(Curve(series, _times(trajectory) * np.sqrt(2 * gravity / width), front / width))
-    return curves
+    fronts = {
+        series: np.quantile(trajectory.pos[..., 0], FRONT, axis=1) + spacing / 2 - low[0]
+        for series, trajectory in (("solver", trial.truth), ("model", trial.model))
+    }
+    free = int((np.maximum.accumulate(fronts["solver"]) < NEAR_WALL * (high - low)[0]).sum())  # the experiments have no wall there
+    times = _times(trial.truth) * np.sqrt(2 * gravity / width)
+    return curves + [Curve(series, times[: len(front)][:free], front[:free] / width) for series, front in fronts.items()]
 
 
 def measured_fronts(path: Path) -> list[Curve]:
