@@ -89,4 +89,4 @@ class Uncertainty:
         self.unlike.warn(self.split)
         if self.coverage is not None:
             self.coverage.write(folder, self.horizons)
-            print((folder / TABLE).read_text())
+            print((folder / TABLE).read_text(encoding="utf-8"))
