@@ -24,7 +24,7 @@ from gpe_pl.rollout.loop import Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, MaterialParameter, MaterialValues, ParameterGroup, param_names, parameters_by_name
 from gpe_pl.solvers.finer_solver import TRACERS, FinerSolver, Refinable
 from gpe_pl.solvers.materials import limits_fault
-from gpe_pl.solvers.scenes import Scene, describe
+from gpe_pl.solvers.scenes import SceneDistribution, describe
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
@@ -151,7 +151,7 @@ class DatasetSpec:
     name: DataName
     size: DataName
     parameters: dict[str, ParameterValues]
-    scene: InstanceOf[Scene]
+    scene: InstanceOf[SceneDistribution]
     solver: InstanceOf[Solver]
     num_train: Annotated[int, Field(ge=1, le=MOST)]
     num_frames: Annotated[int, Field(ge=3, le=MOST)]

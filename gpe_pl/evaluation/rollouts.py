@@ -24,7 +24,7 @@ from gpe_pl.evaluation.scene_files import (
     write_pictures,
 )
 from gpe_pl.evaluation.settings import EvaluationSettings
-from gpe_pl.export.play_page import Film
+from gpe_pl.export.play_page import SolverFilm
 from gpe_pl.graphs.batching import batched
 from gpe_pl.learned.ensemble import LearnedEnsemble, configured, members_of
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -99,7 +99,7 @@ def evaluate(
     simulator = _as_evaluated(simulator, settings)
     run_dir.mkdir(parents=True, exist_ok=True)
     predictor = Predictor(simulator, settings, label, controls, stride, start_frame, seconds=[])
-    rows, films = list[Row](), list[Film]()
+    rows, films = list[Row](), list[SolverFilm]()
     for split in settings.splits:
         rows.append(Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split, stride=stride)))
         curves: dict[str, list[np.ndarray]] = {}
@@ -112,7 +112,7 @@ def evaluate(
                     curves.setdefault(model, []).append(per_frame_mse(prediction, scene.truth))
             if number < settings.num_pictures:
                 _draw(run_dir, scene, split, number, label, settings)
-                films.append(Film(f"{split} {number}", scene.trajectory))
+                films.append(SolverFilm(f"{split} {number}", scene.trajectory))
         if curves and settings.num_pictures:
             write_error_curve(run_dir / f"error_curve_{split}.png", curves, frame_dt)
     write_models(run_dir, members_of(simulator)[0], label, films, settings.export)

@@ -14,7 +14,7 @@ from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.evaluation.settings import EvaluationSettings, Export
 from gpe_pl.export.onnx_network import export_network
 from gpe_pl.export.play_model import check
-from gpe_pl.export.play_page import Film, write_page
+from gpe_pl.export.play_page import SolverFilm, write_page
 from gpe_pl.export.program import export_model
 from gpe_pl.learned.ensemble import LearnedEnsemble
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -102,7 +102,7 @@ def write_exports(run_dir: Path, split: str, number: int, truth: Trajectory, pre
         write_animation(stem.with_suffix(".mp4"), truth, {LEARNED: prediction}, fps=20, stride=max(1, truth.num_frames // 200))
 
 
-def write_models(run_dir: Path, simulator: LearnedSimulator, label: str, films: list[Film], formats: list[Export]) -> None:
+def write_models(run_dir: Path, simulator: LearnedSimulator, label: str, films: list[SolverFilm], formats: list[Export]) -> None:
     """Write the simulator to ``run_dir`` in those of the ``formats`` that hold it. A page calls it ``label`` and shows the films."""
     if "model" in formats:
         export_model(simulator, run_dir / "model.pt2")

@@ -28,7 +28,7 @@ from gpe_pl.rollout.guard import Guard, unsound
 from gpe_pl.rollout.loop import Simulator, Start, frames
 from gpe_pl.schema import MATERIALS, MaterialValues, parameters_by_name
 from gpe_pl.solvers.materials import limits_fault
-from gpe_pl.solvers.scenes import Scene, describe
+from gpe_pl.solvers.scenes import SceneDistribution, describe
 from gpe_pl.system.machine import environment, peak_resident
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
@@ -68,7 +68,7 @@ class Measurement:
     unit: str
 
 
-def start(simulator: LearnedSimulator, scene: Scene, settings: ShowcaseSettings) -> tuple[State, Metadata]:
+def start(simulator: LearnedSimulator, scene: SceneDistribution, settings: ShowcaseSettings) -> tuple[State, Metadata]:
     """Return the initial state of the scene and its metadata. All velocities of the history equal the initial velocity.
 
     Raises:

@@ -38,7 +38,7 @@ class PageFolderError(GpeError, ValueError):
 
 
 @dataclass(frozen=True)
-class Film:
+class SolverFilm:
     """A trajectory of a solver, which the page shows beside the model from the same start.
 
     Attributes:
@@ -50,7 +50,9 @@ class Film:
     trajectory: Trajectory
 
 
-def write_page(folder: Path | str, simulators: Mapping[str, LearnedSimulator], films: Mapping[str, Sequence[Film]] | None = None) -> Path:
+def write_page(
+    folder: Path | str, simulators: Mapping[str, LearnedSimulator], films: Mapping[str, Sequence[SolverFilm]] | None = None
+) -> Path:
     """Write a page into a folder and return the path of its ``index.html``.
 
     Args:
@@ -78,13 +80,13 @@ def write_page(folder: Path | str, simulators: Mapping[str, LearnedSimulator], f
     return folder / "index.html"
 
 
-def _model_script(name: str, simulator: LearnedSimulator, films: Sequence[Film]) -> str:
+def _model_script(name: str, simulator: LearnedSimulator, films: Sequence[SolverFilm]) -> str:
     about, numbers = model_for_page(simulator)
     about |= {"name": name, "weights": _base64(numbers), "scenes": [_scene(simulator, film) for film in films]}
     return f"(window.gpeModels ||= []).push({json.dumps(about, allow_nan=False)});\n"
 
 
-def _scene(simulator: LearnedSimulator, film: Film) -> dict[str, Any]:
+def _scene(simulator: LearnedSimulator, film: SolverFilm) -> dict[str, Any]:
     """Return the start of a film, and its positions from there on, rounded to 16 bits over the domain."""
     builder, first = simulator.builder, simulator.builder.config.history
     trajectory = film.trajectory

@@ -16,7 +16,7 @@ from gpe_pl.learned.pretrained import model_name, names
 from gpe_pl.system.command_line import ArgumentFault, command, integer, truth
 
 if TYPE_CHECKING:
-    from gpe_pl.export.play_page import Film
+    from gpe_pl.export.play_page import SolverFilm
     from gpe_pl.learned.simulator import LearnedSimulator
 
 SHIPPED = ("sand", "snow")
@@ -43,13 +43,13 @@ class PortFault(GpeError, OSError):
     """Raised when a port cannot be used."""
 
 
-def films_of(simulator: LearnedSimulator, count: int) -> list[Film]:
+def films_of(simulator: LearnedSimulator, count: int) -> list[SolverFilm]:
     """Return films of random scenes like those of the training, with parameters in the middle of the trained range.
 
     Raises:
         NotRecorded: the model was trained on data that this package did not simulate.
     """
-    from gpe_pl.export.play_page import Film
+    from gpe_pl.export.play_page import SolverFilm
     from gpe_pl.scenes.recorded import recorded_scene, recorded_solver
     from gpe_pl.scenes.rollouts import middle_values, solved
 
@@ -59,7 +59,7 @@ def films_of(simulator: LearnedSimulator, count: int) -> list[Film]:
         about = replace(metadata, seed=seed, split="", solver_version=solver.version)
         state = scene.sample(middle_values(simulator), seed)
         films.append(
-            Film(f"scene {seed + 1} of the solver", solved(solver, state, about, first + NUM_FRAMES, f"film {seed + 1} of {count}"))
+            SolverFilm(f"scene {seed + 1} of the solver", solved(solver, state, about, first + NUM_FRAMES, f"film {seed + 1} of {count}"))
         )
     return films
 

@@ -12,7 +12,7 @@ from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.flip import FLIP
 from gpe_pl.solvers.fluid_scenes import FluidScene
 from gpe_pl.solvers.mpm import MPM
-from gpe_pl.solvers.scenes import BodyScene, Scene
+from gpe_pl.solvers.scenes import BodyScene, SceneDistribution
 from gpe_pl.solvers.solid_scenes import SolidScene
 from gpe_pl.system.signatures import checked, parameters
 from gpe_pl.trajectory.trajectory import Metadata
@@ -25,9 +25,9 @@ class NotRecorded(GpeError, ValueError):
     """Raised when metadata do not have the settings of a scene or solver of this package."""
 
 
-def recorded_scene(metadata: Metadata) -> Scene:
+def recorded_scene(metadata: Metadata) -> SceneDistribution:
     """Return the distribution of scenes that trajectories with these metadata come from."""
-    scene: Scene = _rebuilt(metadata, "scene", SCENES, "kind")
+    scene: SceneDistribution = _rebuilt(metadata, "scene", SCENES, "kind")
     return scene
 
 

@@ -1,6 +1,6 @@
-"""Seeded scenes of bodies thrown into a box with obstacles, and the ``Scene`` protocol.
+"""Seeded scenes of bodies thrown into a box with obstacles, and the ``SceneDistribution`` protocol.
 
-``Scene.sample`` depends only on configuration, parameter values, seed and the files that the configuration names.
+``SceneDistribution.sample`` depends only on configuration, parameter values, seed and the files that the configuration names.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MESHED = ("elastomer",)
 
 
 @runtime_checkable
-class Scene(Protocol):
+class SceneDistribution(Protocol):
     """A distribution of initial states."""
 
     @property
@@ -73,7 +73,7 @@ class Scene(Protocol):
     def sample(self, values: Mapping[str, MaterialValues], seed: int) -> State: ...
 
 
-def describe(scene: Scene, frame_dt: float, **provenance: Any) -> Metadata:
+def describe(scene: SceneDistribution, frame_dt: float, **provenance: Any) -> Metadata:
     """Return the metadata of a scene's trajectories. ``provenance`` sets the fields of ``Metadata`` that the scene does not know, and may replace others."""
     return Metadata(
         **{

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gpe_pl.export.play_page import PARTS, Film, PageFolderError, bundled, write_page
+from gpe_pl.export.play_page import PARTS, PageFolderError, SolverFilm, bundled, write_page
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.baselines import Ballistic
 from gpe_pl.rollout.loop import rollout
@@ -26,11 +26,11 @@ PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobil
 NUM_FRAMES = 30
 
 
-def film(simulator: LearnedSimulator) -> Film:
+def film(simulator: LearnedSimulator) -> SolverFilm:
     """Return a film in which particles fly freely."""
     metadata = simulator.builder.metadata
     state = scene(simulator, (FLOOR, SIDE))
-    return Film("flight", rollout(Ballistic(metadata.frame_dt), state, simulator.builder.config.history + NUM_FRAMES, metadata))
+    return SolverFilm("flight", rollout(Ballistic(metadata.frame_dt), state, simulator.builder.config.history + NUM_FRAMES, metadata))
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ NORMAL_90 = 1.645
 """Half-width of the central 90 % of a normal distribution, in standard deviations: intervals without a calibration."""
 
 
-class CalibrationError(GpeError, ValueError):
+class FewScenesError(GpeError, ValueError):
     """Raised when calibration scenes are too few."""
 
 
@@ -75,11 +75,11 @@ def calibrated(pairs: Pairs, level: float = 0.9, adapts: bool = True) -> Calibra
         adapts: take each scene's scale; False gives all scenes intervals of one width, for comparison.
 
     Raises:
-        CalibrationError: there are too few scenes.
+        FewScenesError: there are too few scenes.
     """
     number, least = len(pairs.estimate), max(4, fewest_scenes(level))
     if number < least:
-        raise CalibrationError(
+        raise FewScenesError(
             f"{number} calibration scenes; intervals of {100 * level:g} % need at least {least}: identify more scenes with known values"
         )
     floor = float(np.median(pairs.scale)) if adapts else 0.0

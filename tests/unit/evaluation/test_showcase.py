@@ -15,7 +15,7 @@ from gpe_pl.learned.simulator import LearnedSimulator, SceneError
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.solvers.fluid_scenes import FluidScene
-from gpe_pl.solvers.scenes import Scene
+from gpe_pl.solvers.scenes import SceneDistribution
 from tests import scenes
 
 CANYON = FluidScene("canyon", ((0.0, 3.0), (0.0, 1.5), (0.0, 1.5)), 2 * scenes.SPACING, 60)
@@ -32,7 +32,7 @@ def simulator(accelerations: float = 1.0) -> LearnedSimulator:
 
 def run(
     simulated: LearnedSimulator,
-    scene: Scene,
+    scene: SceneDistribution,
     settings: ShowcaseSettings,
     folder: Path,
     on_progress: Callable[[int, int], None] | None = None,

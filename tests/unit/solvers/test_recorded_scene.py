@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.solvers.recorded_scene import RecordedScene, RecordingError, read_recording
-from gpe_pl.solvers.scenes import Scene, describe
+from gpe_pl.solvers.scenes import SceneDistribution, describe
 
 msgpack = pytest.importorskip("msgpack")
 zstandard = pytest.importorskip("zstandard")
@@ -81,7 +81,7 @@ def test_scaling_keeps_froude_and_reynolds_numbers(file: str, s: float) -> None:
 @pytest.mark.parametrize("spacing", [0.05, 0.1])
 def test_walls_have_the_spacing_of_the_model_and_particles_their_place_above_them(file: str, spacing: float) -> None:
     scene = RecordedScene(file, 2 * spacing)
-    assert isinstance(scene, Scene)
+    assert isinstance(scene, SceneDistribution)
     state = scene.sample({}, 0)
     s = spacing / 0.1
     assert scene.scale == pytest.approx(s) and scene.max_nodes == state.num_nodes == 8

@@ -10,7 +10,7 @@ import pytest
 
 from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.schema import NODE_TYPES, STICKY, node_code
-from gpe_pl.solvers.scenes import BodyScene, Scene, describe
+from gpe_pl.solvers.scenes import BodyScene, SceneDistribution, describe
 
 DENSITY = {"sand": 1600.0, "snow": 400.0, "elastomer": 1000.0}
 
@@ -166,4 +166,4 @@ def test_cells_fill_the_lattice_of_an_elastomer(dim):
 
 def test_only_meshed_materials_have_cells(scenes):
     assert scenes[0].cells is None and scenes[0].rest_pos is None
-    assert isinstance(CONFIG, Scene)
+    assert isinstance(CONFIG, SceneDistribution)

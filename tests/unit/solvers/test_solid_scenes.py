@@ -11,7 +11,7 @@ from gpe_pl.geometry.shapes import Sphere, signed_distance
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import MATERIALS, STICKY, node_code
 from gpe_pl.solvers.fem import FEM
-from gpe_pl.solvers.scenes import Scene, describe
+from gpe_pl.solvers.scenes import SceneDistribution, describe
 from gpe_pl.solvers.solid_scenes import SolidScene
 
 SQUARE = ((0.0, 1.0), (0.0, 1.0))
@@ -35,7 +35,7 @@ def drawn(kind, seed):
 
 def test_is_a_scene(config):
     assert config.materials == ("solid",) and config.dim == len(config.bounds)
-    assert isinstance(config, Scene)
+    assert isinstance(config, SceneDistribution)
 
 
 def test_same_seed_gives_same_bytes(config):

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from gpe_pl.evaluation.identification.answer import Answer, pairs_of, read_answers, side_by_side
-from gpe_pl.evaluation.identification.calibration import CalibrationError, Pairs, calibrated
+from gpe_pl.evaluation.identification.calibration import FewScenesError, Pairs, calibrated
 from gpe_pl.evaluation.identification.gradient_check import GradientCheck, gradient_check
 from gpe_pl.evaluation.identification.observations import ObservationError, Observations, ObservationSettings
 from gpe_pl.evaluation.identification.results import Task, write_table
@@ -251,7 +251,7 @@ def test_calibration_corrects_and_covers() -> None:
     constant = calibrated(biased(200, 0), adapts=False)
     _, lowest, highest = np.array([constant.interval(e, 1.0) for e in new.estimate]).T
     assert interval_score(low, high, new.truth, 0.9).mean() < interval_score(lowest, highest, new.truth, 0.9).mean()
-    with pytest.raises(CalibrationError, match="8 calibration scenes; .* at least 9"):
+    with pytest.raises(FewScenesError, match="8 calibration scenes; .* at least 9"):
         calibrated(biased(8, 0))
 
 
