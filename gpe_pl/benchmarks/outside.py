@@ -320,11 +320,13 @@ def _report(records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, s
 
 def figures(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
     """Draw one figure per experiment and model: experiment or law, solver and model on the same axes."""
-    import matplotlib.pyplot as plt
+    from gpe_pl.viz.film_strip import new_figure
 
     drawn = {}
     for (experiment, model), curves in _curves(records).items():
-        figure, axes = plt.subplots(figsize=(5.2, 3.6), layout="constrained")
+        figure = new_figure(5.2, 3.6)
+        figure.set_layout_engine("constrained")
+        axes = figure.subplots()
         limit = max((curve.x.max() for curve in curves if curve.series == "solver"), default=np.inf)
         for curve in curves:
             is_run = curve.series in ("solver", "model")

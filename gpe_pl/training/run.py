@@ -33,6 +33,13 @@ from gpe_pl.training.loss_terms import Loss
 from gpe_pl.training.module import Compile, Schedule, TrainingError, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 
+KNOWN_WARNINGS = (
+    r"`isinstance\(treespec, LeafSpec\)` is deprecated",  # concerns Lightning and PyTorch
+    r"Checkpoint directory .* exists and is not empty",  # normal when resuming
+    r"You have overridden `transfer_batch_to_device` in `LightningModule`",  # meant so
+)
+"""Warnings that training does not show."""
+
 log = logging.getLogger(__name__)
 
 Targets = Literal["trajectory", "solver"]
@@ -219,8 +226,8 @@ def train(
     last = checkpoints.last if checkpoints.last.exists() else None
     if last is not None:
         log.info("resuming from %s", last)
-    for known in (r"`isinstance\(treespec, LeafSpec\)` is deprecated", r"Checkpoint directory .* exists and is not empty"):
-        warnings.filterwarnings("ignore", known)  # the first concerns Lightning and PyTorch; the second is normal when resuming
+    for known in KNOWN_WARNINGS:
+        warnings.filterwarnings("ignore", known)
     try:
         with interruption, checkpoints.taken_up():
             trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)

@@ -15,7 +15,9 @@ from gpe_pl.metrics import (
     bootstrap_interval,
     bootstrap_ratio,
     energy_distance,
+    liquids,
     per_frame_mse,
+    rigid,
     rollout_metrics,
 )
 from gpe_pl.trajectory.boundary import Boundary
@@ -74,6 +76,8 @@ def test_rollout_mse_is_the_mean_over_frames_one_to_horizon(ground_truth):
         "fraction_outside",
         "mirror_error",
         *bodies.UNITS,
+        *liquids.UNITS,
+        *rigid.UNITS,
     }
 
 
@@ -175,6 +179,8 @@ def test_periodic_axes_take_the_short_way():
     records = rollout_metrics(prediction, truth, (2,))
     assert {r.metric for r in records} == set(UNITS) - {
         *bodies.UNITS,
+        *liquids.UNITS,
+        *rigid.UNITS,
         "mirror_error",
         "energy_distance",
         "angular_momentum_error",

@@ -124,8 +124,10 @@ def _load(rollout: Path, facts: Facts) -> Loaded:
                 for name, found in arrays.items():
                     if name == "positions" or is_named(file, name):
                         found.append(hdf5.array(file, name, "node, component", "f"))
-                        if found[-1].shape != found[0].shape or found[-1].shape[1] not in (3, 4, 6):
-                            raise Refusal(f"{name} is {list(found[-1].shape)}, expected {list(found[0].shape[:1])} rows of 3 components")
+                        if found[-1].shape != found[0].shape:
+                            raise Refusal(f"{name} is {list(found[-1].shape)}, expected {list(found[0].shape)} as in the first frame")
+                        if found[-1].shape[1] not in (3, 4, 6):
+                            raise Refusal(f"{name} has {found[-1].shape[1]} components, expected 3, 4 or 6")
                 if k == 0 and is_named(file, "scene_params"):
                     scene = hdf5.array(file, "scene_params", "parameter", "f")
         except Refusal as refusal:

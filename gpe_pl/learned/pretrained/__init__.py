@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from gpe_pl.files.names import portable
 
@@ -33,7 +34,7 @@ def fingerprint(checkpoint: Path | str) -> str:
     return f"{path.name} (sha256 {sha256(path.read_bytes()).hexdigest()[:12]})"
 
 
-def model_name(checkpoint: Path | str | Sequence[str] | None, runs: Path | str) -> str:
+def model_name(checkpoint: Path | str | Sequence[Any] | None, runs: Path | str) -> str:
     """Return the name of a model for use in folder names: that of a shipped model, or the path of its run below ``runs`` with ``_`` for ``/``.
 
     An ensemble has the name of its first member and the number of members.

@@ -104,7 +104,7 @@ def rollouts(tmp_path: Path) -> Path:
             "has 19 nodes, expected 64 for each of 0 cubes of scene_params",
         ),
         (lambda f: set_arrays(f / "4.h5", positions=np.zeros((7, 3), "f4")), r"frame 4: positions is \[7, 3\], expected \[20, 3\]"),
-        (lambda f: set_arrays(f / "0.h5", positions=np.zeros((20, 6), "f4")), r"frame 0: positions is \[20, 6\], expected \[20, 3\]"),
+        (lambda f: set_arrays(f / "0.h5", positions=np.zeros((20, 6), "f4")), r"frame 1: positions is \[20, 3\], expected \[20, 6\]"),
         (lambda f: set_arrays(f / "0.h5", clusters=np.zeros(3, int)), "has clusters, as BoxBath, but only 20 nodes"),
         (lambda f: [p.unlink() for p in f.iterdir()], "has no 0.h5"),
     ],
