@@ -69,6 +69,8 @@ def check(simulator: LearnedSimulator) -> None:
         wrong = "a model with model.material_embedding=mlp"
     elif builder.config.features != "contact" or not builder.config.boundary_condition:
         wrong = "a model without contact features"
+    elif not all(trained.isfinite().all() for _, trained in simulator.trained_ranges()):
+        wrong = "a model that was not trained"
     if wrong:
         raise PageError(
             f"the page computes GPE models of particles in 2D, and not {wrong}; choose sand or snow, or look at a rollout with the viewer"

@@ -215,6 +215,10 @@ def test_film_and_model_are_exported_on_request(tiny_data: Path, tmp_path: Path)
 def test_a_page_is_exported_with_films_of_the_solver(tiny_data: Path, tmp_path: Path) -> None:
     simulator = untrained()
     simulator.model = GPE(simulator.builder.spec, num_message_passing_steps=1, hidden_channels=8, edge_state="geometry")
+    simulator.save(tmp_path / "new.ckpt")
+    with pytest.raises(PageError, match="a model that was not trained"):
+        evaluate(tiny_data, tmp_path, tmp_path / "new.ckpt", "evaluation.export=[page]")
+    simulator.get_buffer("trained_sand")[:, 0] = torch.tensor([20.0, 42.5])
     simulator.save(tmp_path / "own.ckpt")
     evaluate(tiny_data, tmp_path, tmp_path / "own.ckpt", "evaluation.num_pictures=2", "evaluation.export=[page]")
     folder = tmp_path / "evaluation_test_unseen" / "page"
