@@ -31,7 +31,7 @@ class MirrorAverage:
     """
 
     bounds: Sequence[tuple[float, float]]
-    _images: dict[int, tuple[Boundary, list[Boundary]]] = field(default_factory=dict, repr=False)
+    _images: dict[tuple[int, tuple[Reflection, ...]], tuple[Boundary, list[Boundary]]] = field(default_factory=dict, repr=False)
 
     def next_states(
         self, next_states: Callable[[list[State]], list[State | SimulationError]], states: list[State]
@@ -64,11 +64,12 @@ class MirrorAverage:
 
     def _boundaries(self, boundary: Boundary, reflections: list[Reflection]) -> list[Boundary]:
         """Return the images of a boundary; those of a boundary at rest are made once, and so are their search trees."""
-        known = self._images.get(id(boundary))
+        key = id(boundary), tuple(reflections)  # a scene with another gravity may share the boundary
+        known = self._images.get(key)
         if known is None or known[0] is not boundary:
             if len(self._images) >= MAX_BOUNDARIES:
                 self._images.clear()
-            known = self._images[id(boundary)] = boundary, [reflection.boundary(boundary) for reflection in reflections]
+            known = self._images[key] = boundary, [reflection.boundary(boundary) for reflection in reflections]
         return known[1]
 
     def _mean(self, state: State | SimulationError, images: list[tuple[Reflection, Any]]) -> State | SimulationError:

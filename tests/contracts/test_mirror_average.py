@@ -88,9 +88,10 @@ def test_scenes_together_move_as_alone(scene: tuple[LearnedSimulator, Trajectory
 
 def test_gravity_along_every_axis_leaves_nothing_to_average(scene: tuple[LearnedSimulator, Trajectory]) -> None:
     learned, trajectory = scene
-    state = learned.initial_state(trajectory, START)
+    mean, state = averaged(learned), learned.initial_state(trajectory, START)
+    mean.step(state)  # has images of the boundary, which the next state shares
     tilted = replace(state, gravity=torch.full_like(state.gravity, -1.0))
-    assert torch.equal(averaged(learned).step(tilted).pos, learned.step(tilted).pos)
+    assert torch.equal(mean.step(tilted).pos, learned.step(tilted).pos)
 
 
 def test_checkpoints_store_it(scene: tuple[LearnedSimulator, Trajectory], tmp_path: Path) -> None:
