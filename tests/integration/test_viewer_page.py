@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from io import BytesIO
@@ -19,21 +18,6 @@ from gpe_pl.trajectory.trajectory import Termination, Trajectory
 from gpe_pl.viz.coloring import MATERIAL_COLORS
 from gpe_pl.viz.viewer import write_viewer
 from tests.unit.viz.conftest import falling, falling_mesh
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL without a graphics card
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    with playwright.sync_playwright() as p:
-        if path is None and not Path(p.chromium.executable_path).exists():
-            pytest.skip(f"no browser is installed: none of {', '.join(BROWSERS)}, and none of playwright's own")
-        chromium = p.chromium.launch(executable_path=path, args=SOFTWARE)
-        yield chromium
-        chromium.close()
 
 
 class Viewer:
