@@ -49,6 +49,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.reports.sweep_table import conclusion, report_evaluation
     from gpe_pl.rollout.skips import Skips
     from gpe_pl.system.locks import locked
+    from gpe_pl.system.progress import no_bar, progress_bar
     from gpe_pl.system.provenance import recorded
     from gpe_pl.training.run import TrainerSettings, set_up
 
@@ -80,8 +81,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
                 controls = material_controls(cfg, settings, root, start_frame)
                 uncertainty = Uncertainty(checkpoints, simulator, settings, cfg.split, split_checksum(root, cfg.split), cfg.calibrate)
                 evaluated_model = ensemble if len(checkpoints) > 1 else simulator
-                stride = stride_of(evaluated)
-                evaluate(evaluated_model, root, settings, folder, controls=controls, stride=stride, see=uncertainty.see)
+                stride, bars = stride_of(evaluated), progress_bar if cfg.trainer.progress else no_bar
+                evaluate(evaluated_model, root, settings, folder, controls=controls, stride=stride, see=uncertainty.see, bars=bars)
                 uncertainty.finish(folder)
             finally:
                 release(folder)

@@ -36,6 +36,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.lookup import model_class
 from gpe_pl.reports.finished_runs import Run, rollout_errors, table_of
 from gpe_pl.rollout.loop import Restartable
+from gpe_pl.system.progress import no_bar, progress_bar
 from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_time_key, within_budget
 from gpe_pl.training.loss_terms import mean_num_neighbors
 from gpe_pl.training.module import TrainingModule
@@ -152,7 +153,10 @@ class FitRun:
     def evaluate(self, checkpoint: Path) -> None:
         """Roll the model out on the evaluated splits, and log the mean errors."""
         simulator = LearnedSimulator.from_checkpoint(checkpoint, self.device)
-        rows = evaluate(simulator, self.evaluated_root, self.evaluation, self.folder, controls=self.controls, stride=self.evaluated_stride)
+        bars = progress_bar if self.trainer.progress else no_bar
+        rows = evaluate(
+            simulator, self.evaluated_root, self.evaluation, self.folder, controls=self.controls, stride=self.evaluated_stride, bars=bars
+        )
         publish(self._loggers, self.folder, means(rows))
 
     def error(self) -> float:

@@ -158,6 +158,8 @@ class CommandLauncher(Launcher):
         """
         from rich.console import Console
 
+        from gpe_pl.system.progress import progress_bar
+
         setup_globals()
         jobs = [self._job(initial_job_idx + k, overrides) for k, overrides in enumerate(job_overrides)]
         module = sys.modules["__main__"].__spec__
@@ -166,12 +168,15 @@ class CommandLauncher(Launcher):
         console.print(f"{len(jobs)} runs, {self.place(jobs)}; each has its {LOG} below {one_line(str(self.config.hydra.sweep.dir))}")
         returns: dict[int, JobReturn] = {}
         try:
-            for k, outcome in self.run(jobs, module.name):
-                returns[k] = outcome
-                if isinstance(outcome._return_value, UsageError):
-                    raise outcome._return_value
-                failed = outcome.status is JobStatus.FAILED
-                console.print(f"{len(returns)}/{len(jobs)} {'failed' if failed else 'done'}: {one_line(jobs[k].name)}")
+            with progress_bar(str(self.config.hydra.job.name) + " sweep") as on_progress:
+                on_progress(0, len(jobs))
+                for k, outcome in self.run(jobs, module.name):
+                    returns[k] = outcome
+                    if isinstance(outcome._return_value, UsageError):
+                        raise outcome._return_value
+                    failed = outcome.status is JobStatus.FAILED
+                    console.print(f"{len(returns)}/{len(jobs)} {'failed' if failed else 'done'}: {one_line(jobs[k].name)}")
+                    on_progress(len(returns), len(jobs))
         except KeyboardInterrupt:
             num_done = sum(r.status is JobStatus.COMPLETED for r in returns.values())
             raise SweepError(

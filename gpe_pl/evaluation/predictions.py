@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from gpe_pl.data.dataset import long_enough
+from gpe_pl.data.dataset import long_enough, open_split
 from gpe_pl.evaluation.material_controls import UNSEEN, AtValue, MaterialControls, label_of
 from gpe_pl.evaluation.metric_rows import EXACT
 from gpe_pl.evaluation.rollout_cost import Timed
+from gpe_pl.evaluation.scene_files import check_scene
 from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.geometry.shapes import surface_tolerance
 from gpe_pl.learned.approximate import approximate
@@ -26,6 +28,7 @@ from gpe_pl.rollout.ensemble import spread
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Simulator, Start, fraction_outside, rollout, rollouts
 from gpe_pl.schema import RADIUS, Split
+from gpe_pl.system.progress import Bars, Progress, no_bar
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -73,6 +76,7 @@ class Predictor:
         stride: number of stored frames in a frame of the simulator.
         start_frame: frame at which rollouts start.
         seconds: processor time per scene of each step so far [s].
+        bars: makes the progress bar of a split, which counts frames of the simulator's own rollouts.
     """
 
     simulator: LearnedSimulator | LearnedEnsemble
@@ -82,18 +86,32 @@ class Predictor:
     stride: int
     start_frame: int
     seconds: list[float]
+    bars: Bars = no_bar
 
     def scenes(self, root: Path, split: Split) -> Iterator[PredictedScene]:
         """Yield the first ``settings.num_trajectories`` scenes of a split, in its order."""
         trajectories = islice(long_enough(root, split, self.start_frame, self.stride), self.settings.num_trajectories)
         controls = self.controls if split == UNSEEN else None
-        first = 0
-        while batch := list(islice(trajectories, SCENES_AT_ONCE)):
-            yield from self._batch(batch, first, controls)
-            first += len(batch)
+        first = done = 0
+        with self.bars(f"evaluating {split}") as on_progress:
+            stored = [-(-t.num_stored // self.stride) for t in open_split(root, split, cache_bytes=0)]
+            total = self._num_frames(stored[: self.settings.num_trajectories])
+            on_progress(done, total)
+            while batch := list(islice(trajectories, SCENES_AT_ONCE)):
+                for trajectory in batch:
+                    check_scene(self.settings, trajectory)
+                yield from self._batch(batch, first, controls, _each(on_progress, done, total))
+                first, done = first + len(batch), done + self._num_frames([t.num_frames for t in batch])
+                on_progress(done, total)  # rollouts that stopped early lack frames
 
-    def _batch(self, trajectories: list[Trajectory], first: int, controls: MaterialControls | None) -> Iterator[PredictedScene]:
-        """Roll several scenes out at once. ``first`` is the number of the first one in its split."""
+    def _num_frames(self, lengths: Sequence[int]) -> int:
+        """Return the number of predicted frames of trajectories with these numbers of frames."""
+        return sum(max(0, length - 1 - self.start_frame) for length in lengths)
+
+    def _batch(
+        self, trajectories: list[Trajectory], first: int, controls: MaterialControls | None, on_frame: Callable[[], Any]
+    ) -> Iterator[PredictedScene]:
+        """Roll several scenes out at once. ``first`` is the number of the first one in its split; ``on_frame`` is called for each predicted frame."""
         members, dt = members_of(self.simulator), trajectories[0].metadata.frame_dt
         truths = [trajectory.frames(self.start_frame) for trajectory in trajectories]
         starts = [start_of(self.simulator, self.start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
@@ -103,8 +121,9 @@ class Predictor:
         for watch, own in zip(watches, starts, strict=True):
             watch.see(0, own.state)
 
-        def count(scene: int, frame: int, state: State) -> None:
+        def see(scene: int, frame: int, state: State) -> None:
             watches[scene].see(frame, state)
+            on_frame()
             for name in totals[scene]:
                 totals[scene][name] += getattr(state, name)
             if len(members) > 1:
@@ -114,7 +133,7 @@ class Predictor:
             return Contained(inner, dt) if self.settings.containment else inner
 
         runner = combined(members, lambda member: within_walls(approximate(member)))
-        predicted = rollouts(Timed(runner, self.seconds), starts, count)
+        predicted = rollouts(Timed(runner, self.seconds), starts, see)
         free = self._uncontained(combined(members, approximate), starts, first) if self.settings.containment else predicted
         is_exact = all(approximate(member) is member for member in members)
         exact = None if is_exact else rollouts(combined(members, within_walls), starts)
@@ -159,6 +178,12 @@ class Predictor:
             if free is not None:
                 counts["fraction_outside_uncontained"] = _fraction_outside(free, 1, steps, tolerance=1e-3 * truth.metadata.spacing)
         return counts
+
+
+def _each(on_progress: Progress, done: int, total: int) -> Callable[[], Any]:
+    """Return a function that counts one more than ``done`` with each call."""
+    numbers = count(done + 1)
+    return lambda: on_progress(next(numbers), total)
 
 
 def start_of(simulator: LearnedSimulator | LearnedEnsemble, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:

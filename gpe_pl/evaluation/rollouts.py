@@ -31,6 +31,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.schema import param_names
+from gpe_pl.system.progress import Bars, no_bar
 from gpe_pl.trajectory.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -50,6 +51,7 @@ def evaluate(
     controls: MaterialControls | None = None,
     stride: int = 1,
     see: See | None = None,
+    bars: Bars = no_bar,
 ) -> list[Row]:
     """Roll out every trajectory of the splits, and write metrics and pictures to ``run_dir``.
 
@@ -83,6 +85,7 @@ def evaluate(
         controls: prepared controls of scenes with unseen parameters.
         stride: number of stored frames in a frame of the simulator.
         see: called for each scene after its rollouts, with its split, number, parameter group and parameter. The rows that it returns are added.
+        bars: makes the progress bar of a split.
 
     Returns:
         The rows of ``metrics.csv``.
@@ -91,6 +94,7 @@ def evaluate(
         StartError: ``settings.start_time`` leaves too little history, or is between frames.
         SceneError: the data do not fit the simulator.
         ExportError, PageError: a format in ``settings.export`` cannot be written.
+        RigidBodyError: a scene has rigid bodies, which a format in ``settings.export`` would ignore.
     """
     first = members_of(simulator)[0]
     frame_dt = first.builder.metadata.frame_dt
@@ -98,7 +102,7 @@ def evaluate(
     check_formats(settings, simulator)
     simulator = _as_evaluated(simulator, settings)
     run_dir.mkdir(parents=True, exist_ok=True)
-    predictor = Predictor(simulator, settings, label, controls, stride, start_frame, seconds=[])
+    predictor = Predictor(simulator, settings, label, controls, stride, start_frame, seconds=[], bars=bars)
     rows, films = list[Row](), list[SolverFilm]()
     for split in settings.splits:
         rows.append(Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split, stride=stride)))

@@ -15,7 +15,7 @@ from gpe_pl.evaluation.settings import EvaluationSettings, Export
 from gpe_pl.export.onnx_network import export_network
 from gpe_pl.export.play_model import check
 from gpe_pl.export.play_page import SolverFilm, write_page
-from gpe_pl.export.program import export_model
+from gpe_pl.export.program import export_model, refuse_rigid_bodies
 from gpe_pl.learned.ensemble import LearnedEnsemble
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -55,6 +55,12 @@ def check_formats(settings: EvaluationSettings, simulator: LearnedSimulator | Le
         raise ExportError(
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
         )
+
+
+def check_scene(settings: EvaluationSettings, trajectory: Trajectory) -> None:
+    """Raise ``RigidBodyError`` if ``settings.export`` has a program that would ignore the rigid bodies of this scene."""
+    if {"model", "page"} & {*settings.export}:
+        refuse_rigid_bodies(trajectory.rigid_body)
 
 
 def write_pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predictions: dict[str, Trajectory]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.export.play_model import PageError
+from gpe_pl.export.program import refuse_rigid_bodies
 from gpe_pl.geometry.shapes import Shape
 from gpe_pl.trajectory.boundary import as_numpy
 from gpe_pl.trajectory.state import State
@@ -33,7 +34,12 @@ def state_for_page(state: State, columns: list[int]) -> dict[str, Any]:
     Args:
         state: state whose nodes all have one material.
         columns: columns of the material's parameters.
+
+    Raises:
+        PageError: the page does not know a wall or obstacle.
+        RigidBodyError: the state has rigid bodies.
     """
+    refuse_rigid_bodies(state.rigid_body)
     history = state.vel[:, None] if state.velocity_history is None else state.velocity_history
     return {
         "count": state.num_nodes,

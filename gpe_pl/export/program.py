@@ -214,8 +214,26 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
     return inputs
 
 
+class RigidBodyError(GpeError, ValueError):
+    """Raised for scenes with rigid bodies, whose nodes an exported program would move one by one."""
+
+
+def refuse_rigid_bodies(rigid_body: Any) -> None:
+    """Raise ``RigidBodyError`` if a node belongs to a rigid body. ``rigid_body`` is that of a state or trajectory [node], or None."""
+    if rigid_body is not None and bool((rigid_body >= 0).any()):
+        raise RigidBodyError(
+            f"exported programs and pages do not move rigid bodies as a whole, and this scene has {len({*rigid_body.tolist()} - {-1})}; "
+            "roll it out with this package, or leave model and page out of evaluation.export"
+        )
+
+
 def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
-    """Return the tensors that a program of this simulator takes, for a state with velocity history."""
+    """Return the tensors that a program of this simulator takes, for a state with velocity history.
+
+    Raises:
+        RigidBodyError: the state has rigid bodies.
+    """
+    refuse_rigid_bodies(state.rigid_body)
     builder, spec = simulator.builder, simulator.builder.spec
     topology = replace(builder, config=replace(builder.config, trim_boundary=False)).topology(state)
     mesh, islands = topology.mesh, topology.islands

@@ -143,19 +143,35 @@ class RolloutValidation(Callback):
 
 
 class StepProgress(Callback):
-    """Shows a progress bar over all steps of a training in the terminal of the first process; a resumed training continues at its step."""
+    """Shows a progress bar over all steps of a training, in the terminal of the first process. A resumed training continues at its step.
+
+    Beside it stand the last logged loss, and ``validating`` during a validation.
+    """
 
     def __init__(self) -> None:
         self._bar = ExitStack()
+        self._loss, self._is_validating = "", False
+
+    def note(self) -> str:
+        """Return what stands beside the bar."""
+        return "  ".join(part for part in (self._loss, "validating" if self._is_validating else "") if part)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if trainer.is_global_zero:
-            self._show = self._bar.enter_context(progress_bar("training"))
+            self._show = self._bar.enter_context(progress_bar("training", self.note))
             self._show(trainer.global_step, trainer.max_steps)
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
         if trainer.is_global_zero:
+            if trainer.global_step % trainer.log_every_n_steps == 0 and "train/loss" in trainer.callback_metrics:  # type: ignore[attr-defined]
+                self._loss = f"loss {float(trainer.callback_metrics['train/loss']):.3g}"
             self._show(trainer.global_step, trainer.max_steps)
+
+    def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._is_validating = True
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._is_validating = False
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._bar.close()

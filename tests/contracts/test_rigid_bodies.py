@@ -11,6 +11,10 @@ import pytest
 import torch
 from scipy.spatial.distance import pdist
 
+from gpe_pl.evaluation.rollouts import evaluate
+from gpe_pl.evaluation.settings import EvaluationSettings
+from gpe_pl.export.play_scene import state_for_page
+from gpe_pl.export.program import RigidBodyError, scene_of
 from gpe_pl.geometry.shapes import domain_walls, signed_distance, surface_tolerance
 from gpe_pl.metrics.rollouts import rollout_metrics
 from gpe_pl.rollout.baselines import Ballistic
@@ -109,6 +113,21 @@ def test_containment_moves_a_body_as_a_whole(backend: str) -> None:
         np.testing.assert_allclose(pdist(pos[rows]), pdist(before[rows]), rtol=1e-12)
     assert np.asarray(moved)[:16].all()
     np.testing.assert_allclose(contained.vel - state.vel, (contained.pos - state.pos) / DT, atol=1e-9)
+
+
+def test_exported_programs_and_pages_refuse_rigid_bodies(tmp_path: Path) -> None:
+    truth = falling()
+    simulator = learned(builder_of(truth))
+    start = simulator.initial_state(truth, 2)
+    with pytest.raises(RigidBodyError, match="do not move rigid bodies as a whole, and this scene has 2"):
+        scene_of(simulator, start)
+    with pytest.raises(RigidBodyError):
+        state_for_page(start, [0])
+    write_shard(tmp_path / "test" / "shard-00000.h5", [truth])
+    with pytest.raises(RigidBodyError, match=r"leave model and page out of evaluation\.export"):
+        evaluate(simulator, tmp_path, EvaluationSettings(["test"], num_pictures=0, export=["model"]), tmp_path / "run")
+    assert not [*(tmp_path / "run").iterdir()]
+    assert scene_of(simulator, replace(start, rigid_body=torch.full((41,), -1)))
 
 
 def test_store_and_windows_keep_the_bodies(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import math
 import re
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -182,11 +182,15 @@ def test_a_noise_of_metres_is_refused_before_data_are_generated(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_progress_counts_the_steps_of_the_whole_training(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown: list[tuple[int, int]] = []
+    shown, notes = list[tuple[int, int]](), list[str]()
 
     @contextmanager
-    def bar(_: str) -> Iterator[Progress]:
-        yield lambda done, total: shown.append((done, total))
+    def bar(_: str, note: Callable[[], str]) -> Iterator[Progress]:
+        def on_progress(done: int, total: int) -> None:
+            shown.append((done, total))
+            notes.append(note())
+
+        yield on_progress
 
     monkeypatch.setattr(callbacks, "progress_bar", bar)
     cfg = tiny(tiny_data, tmp_path, *STEPS, "trainer.progress=true", "training.push_fraction=0")
@@ -198,6 +202,7 @@ def test_progress_counts_the_steps_of_the_whole_training(tiny_data: Path, tmp_pa
     shown.clear()
     fit(cfg)
     assert shown == [(step, 6) for step in (4, 5, 6)]
+    assert re.fullmatch(r"loss \d[\d.e-]*", notes[-1])
 
 
 @pytest.mark.slow
