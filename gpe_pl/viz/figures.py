@@ -116,10 +116,17 @@ def error_curve_figure(
     return figure
 
 
+WINDOWS = {"first seventh": (0.0, 1 / 7), "last five sevenths": (2 / 7, 1.0)}
+"""Parts of a training that ``validation_loss_figure`` shows side by side: those of the paper's figure 4, as fractions of all steps."""
+WINDOW_VALUES = 3
+"""Number of validations in the first of ``WINDOWS`` from which the figure shows the two apart."""
+
+
 def validation_loss_figure(curves: Mapping[str, Sequence[tuple[Numbers, Numbers]]], label: str = "validation loss") -> Figure:
     """Draw validation loss against training step on a logarithmic axis: every seed thin, their median thick.
 
-    For the median, seeds that were validated at different steps are interpolated in the logarithm, over the steps that all of them cover.
+    Curves with many values fill two panels, the two ``WINDOWS`` of training, each with its own range of losses. For the median, seeds that were validated at
+    different steps are interpolated in the logarithm, over the steps that all of them cover.
 
     Args:
         curves: one ``(steps, values)`` for each seed, by label. Values that are not finite count as infinite.
@@ -128,10 +135,27 @@ def validation_loss_figure(curves: Mapping[str, Sequence[tuple[Numbers, Numbers]
     Raises:
         ValueError: the steps of a seed do not increase, or there are more curves than can be told apart.
     """
-    figure = new_figure(COLUMN_WIDTH, 2.5)
-    axes = _plain_axes(figure)
     runs = {name: [_clean(*seed) for seed in seeds] for name, seeds in curves.items()}
-    ceiling = _set_log_limits(axes, np.concatenate([values for seeds in runs.values() for _, values in seeds]))
+    every = [seed for seeds in runs.values() for seed in seeds]
+    end = max(steps[-1] for steps, _ in every)
+    dense = all((steps <= WINDOWS["first seventh"][1] * end).sum() >= WINDOW_VALUES for steps, _ in every)
+    windows = WINDOWS if dense else {"": (0.0, 1.0)}
+    figure = new_figure(COLUMN_WIDTH * len(windows), 2.5)
+    for index, (title, (begin, stop)) in enumerate(windows.items()):
+        axes = _plain_axes(figure, (1, len(windows), index + 1))
+        inside = np.concatenate([values[(steps >= begin * end) & (steps <= stop * end)] for steps, values in every])
+        _draw_losses(axes, runs, _set_log_limits(axes, inside))
+        axes.set_xlabel("training step", fontsize=8)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.set_title(title, fontsize=8)
+        axes.set_xlim(begin * end, stop * end or None)
+    figure.axes[0].set_ylabel(label, fontsize=8)
+    figure.axes[0].legend(fontsize=7, frameon=False, handlelength=1.4)
+    return figure
+
+
+def _draw_losses(axes: Axes, runs: Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]], ceiling: float) -> None:
+    """Draw seeds and medians; ``ceiling`` stands for infinity."""
     for (name, seeds), (color, dash) in zip(runs.items(), _styles(len(runs)), strict=True):
         for steps, values in seeds:
             axes.plot(steps, np.minimum(values, ceiling), color=color, linewidth=0.5, alpha=0.45)
@@ -140,12 +164,6 @@ def validation_loss_figure(curves: Mapping[str, Sequence[tuple[Numbers, Numbers]
         common = common[(common >= start) & (common <= stop)]
         logs = np.stack([np.interp(common, s, np.log(np.minimum(v, ceiling))) for s, v in seeds])
         axes.plot(common, np.exp(np.median(logs, axis=0)), color=color, linestyle=dash, linewidth=1.6, label=name)
-    axes.set_xlabel("training step", fontsize=8)
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.set_ylabel(label, fontsize=8)
-    axes.set_xlim(left=0)
-    axes.legend(fontsize=7, frameon=False, handlelength=1.4)
-    return figure
 
 
 def _clean(steps: Numbers, values: Numbers) -> tuple[np.ndarray, np.ndarray]:
@@ -164,9 +182,9 @@ def _styles(count: int) -> list[tuple[str, str]]:
     return [(PALETTE[k % len(PALETTE)], dashes[k % len(dashes)]) for k in range(count)]
 
 
-def _plain_axes(figure: Figure) -> Axes:
+def _plain_axes(figure: Figure, place: tuple[int, int, int] = (1, 1, 1)) -> Axes:
     figure.set_layout_engine("constrained")
-    axes = figure.add_subplot()
+    axes = figure.add_subplot(*place)
     axes.set_yscale("log")
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_linewidth(0.6)

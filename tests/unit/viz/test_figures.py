@@ -139,6 +139,16 @@ def test_validation_loss_of_seeds_with_different_steps_uses_the_common_range():
     np.testing.assert_allclose(axes.lines[2].get_ydata(), 10)
 
 
+def test_validation_losses_with_many_values_show_the_start_and_the_end_of_training_apart():
+    steps = np.arange(1, 29) * 100
+    first, last = validation_loss_figure({"odd": [(steps, 100.0 / steps)], "directed": [(steps, 200.0 / steps)]}).axes
+    assert first.get_xlim() == pytest.approx((0, 400))
+    assert last.get_xlim() == pytest.approx((800, 2800))
+    assert first.get_ylim()[1] > 2.0  # the largest loss of the first seventh
+    assert last.get_ylim()[0] < 100 / 2800
+    assert last.get_ylim()[1] < 1.0  # the range of its own window, in which curves of the end can be told apart
+
+
 def test_no_two_curves_look_alike():
     (axes,) = error_curve_figure({str(k): [np.ones(3)] for k in range(20)}, 1.0).axes
     assert len({(line.get_color(), line.get_linestyle()) for line in axes.lines}) == 20
