@@ -181,7 +181,7 @@ def one_step_nmse(
     members[0].check_scene(views[0].window(0, 1).metadata)
     datasets = [WindowDataset(views, member.builder) for member in members]
     windows = np.unique(np.linspace(0, len(datasets[0]) - 1, min(len(datasets[0]), num_windows)).round().astype(int))
-    metric = OneStepNMSE()
+    metric = OneStepNMSE().to(members[0].acceleration_std.device)
     with torch.inference_mode():
         for chosen in np.array_split(windows, -(-len(windows) // SCENES_AT_ONCE)):
             batches = [batched([dataset[int(window)] for window in chosen]).to(members[0].acceleration_std.device) for dataset in datasets]
