@@ -115,8 +115,7 @@ def evaluate(
                 if model in (label, EXACT, *BASELINES):
                     curves.setdefault(model, []).append(per_frame_mse(prediction, scene.truth))
             if number < settings.num_pictures:
-                _draw(run_dir, scene, split, number, label, settings)
-                films.append(SolverFilm(f"{split} {number}", scene.trajectory))
+                films.append(_draw(run_dir, scene, split, number, label, settings))
         if curves and settings.num_pictures:
             write_error_curve(run_dir / f"error_curve_{split}.png", curves, frame_dt)
     write_models(run_dir, members_of(simulator)[0], label, films, settings.export)
@@ -135,12 +134,13 @@ def _as_evaluated(simulator: LearnedSimulator | LearnedEnsemble, settings: Evalu
     )
 
 
-def _draw(run_dir: Path, scene: PredictedScene, split: str, number: int, label: str, settings: EvaluationSettings) -> None:
-    """Write pictures and exports of a scene."""
+def _draw(run_dir: Path, scene: PredictedScene, split: str, number: int, label: str, settings: EvaluationSettings) -> SolverFilm:
+    """Write pictures and exports of a scene. Return the film of its solver for the page."""
     write_pictures(run_dir, split, number, scene.truth, {label: scene.predictions[label]})
     write_exports(run_dir, split, number, scene.truth, scene.predictions[label], settings.export)
     if scene.at_values:
         write_parameter_picture(run_dir / f"parameters_{split}_{number:02d}.png", scene.at_values)
+    return SolverFilm(f"{split} {number}", scene.trajectory)
 
 
 def _rows(scene: PredictedScene, about: About, label: str, horizons: dict[int, str]) -> Iterator[Row]:
