@@ -138,7 +138,7 @@ def _identity(cfg: DictConfig, root: Path, simulator: LearnedSimulator) -> dict[
     beside = path_beside(checkpoints)
     bands = {"calibrate": True} if cfg.calibrate else {"bands": sha256(beside.read_bytes()).hexdigest()[:12]} if beside.is_file() else {}
     values: Any = OmegaConf.to_container(cfg, resolve=True)
-    without = ("splits", "data", "num_pictures", "export")  # do not change the metrics
+    without = ("splits", "data", "num_pictures", "export", "quantities")  # do not change the metrics
     evaluation = {key: value for key, value in values["evaluation"].items() if key not in without}
     return {
         "checkpoint": prints[0] if len(prints) == 1 else prints,

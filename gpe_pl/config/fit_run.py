@@ -196,7 +196,8 @@ class FitRun:
     def _config(self) -> dict[str, Any]:
         """Everything that the results depend on."""
         checksums = {split: split_checksum(self.evaluated_root, split) for split in self.evaluation.splits}
-        return self._trained | {"evaluation": self._settings["evaluation"] | {DATA_CHECKSUMS: checksums}}
+        settings = {key: value for key, value in self._settings["evaluation"].items() if key != "quantities"}  # changes no metric
+        return self._trained | {"evaluation": settings | {DATA_CHECKSUMS: checksums}}
 
     @cached_property
     def _loggers(self) -> list[Any]:

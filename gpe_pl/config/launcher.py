@@ -168,7 +168,7 @@ class CommandLauncher(Launcher):
         console.print(f"{len(jobs)} runs, {self.place(jobs)}; each has its {LOG} below {one_line(str(self.config.hydra.sweep.dir))}")
         returns: dict[int, JobReturn] = {}
         try:
-            with progress_bar(str(self.config.hydra.job.name) + " sweep") as on_progress:
+            with progress_bar("sweep") as on_progress:
                 on_progress(0, len(jobs))
                 for k, outcome in self.run(jobs, module.name):
                     returns[k] = outcome

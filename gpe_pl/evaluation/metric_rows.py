@@ -55,6 +55,10 @@ class Row:
     value: float
 
 
+About = tuple[str, int, str, float]
+"""Split, number, parameter group and parameter of a scene, as in ``Row``."""
+
+
 def write_rows(path: Path, rows: list[Row]) -> None:
     """Write rows as CSV, atomically, and their SHA-256 digest to ``{name}.sha256`` in the format of ``sha256sum``."""
     table = io.StringIO(newline="")

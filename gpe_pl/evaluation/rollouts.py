@@ -12,24 +12,17 @@ import torch
 from gpe_pl.data.dataset import WindowDataset, every, open_split, usable
 from gpe_pl.evaluation.horizons import labels
 from gpe_pl.evaluation.material_controls import MaterialControls
-from gpe_pl.evaluation.metric_rows import EXACT, LEARNED, Row, write_rows
+from gpe_pl.evaluation.metric_rows import LEARNED, About, Row, write_rows
 from gpe_pl.evaluation.predictions import SCENES_AT_ONCE, PredictedScene, Predictor
 from gpe_pl.evaluation.rollout_cost import write_cost
-from gpe_pl.evaluation.scene_files import (
-    check_formats,
-    write_error_curve,
-    write_exports,
-    write_models,
-    write_parameter_picture,
-    write_pictures,
-)
+from gpe_pl.evaluation.scene_files import check_formats, write_models
 from gpe_pl.evaluation.settings import EvaluationSettings
+from gpe_pl.evaluation.split_files import SplitFiles
 from gpe_pl.export.play_page import SolverFilm
 from gpe_pl.graphs.batching import batched
 from gpe_pl.learned.ensemble import LearnedEnsemble, configured, members_of
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
-from gpe_pl.rollout.baselines import BASELINES
+from gpe_pl.metrics import OneStepNMSE, rollout_metrics
 from gpe_pl.schema import param_names
 from gpe_pl.system.progress import Bars, no_bar
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -37,8 +30,6 @@ from gpe_pl.trajectory.trajectory import Trajectory
 log = logging.getLogger(__name__)
 
 ONE_STEP_WINDOWS = 256
-About = tuple[str, int, str, float]
-"""Split, number, parameter group and parameter of a scene, as in ``Row``."""
 See = Callable[[PredictedScene, About], Iterable[Row]]
 
 
@@ -58,8 +49,8 @@ def evaluate(
     All rollouts start at ``settings.first_frame`` and run to the end of the ground truth. The files are ``metrics.csv`` with its digest, ``rollout_cost.json``
     (see ``rollout_cost``) and, unless ``settings.num_pictures`` is 0, ``error_curve_*.png``. The first ``settings.num_pictures`` trajectories of each split
     also get ``rollout_*.png``, ``rollout_*.gif``, ``rollout_*.html`` (a viewer), ``stress_*.png`` if the model decodes a stress, and the files of
-    ``settings.export``. With ``controls``, those of ``test_unseen`` also get ``parameters_*.png``: the solver and the model at three values of the material
-    parameters.
+    ``settings.export``. ``settings.quantities`` adds ``quantities_*.png``, ``quantities_*.csv`` and ``parity_*.png``. With ``controls``, those of
+    ``test_unseen`` also get ``parameters_*.png``: the solver and the model at three values of the material parameters.
 
     These metrics are computed here, beside those of ``metrics.rollout_metrics``:
 
@@ -106,18 +97,14 @@ def evaluate(
     rows, films = list[Row](), list[SolverFilm]()
     for split in settings.splits:
         rows.append(Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split, stride=stride)))
-        curves: dict[str, list[np.ndarray]] = {}
+        files = SplitFiles(run_dir, split, label, settings)
         for number, scene in enumerate(predictor.scenes(root, split)):
             about = (split, number, scene.truth.metadata.parameter_group, _parameter(scene.trajectory))
             rows += _rows(scene, about, label, labels(settings.horizons, frame_dt))
             rows += see(scene, about) if see else []
-            for model, prediction in scene.predictions.items():
-                if model in (label, EXACT, *BASELINES):
-                    curves.setdefault(model, []).append(per_frame_mse(prediction, scene.truth))
-            if number < settings.num_pictures:
-                films.append(_draw(run_dir, scene, split, number, label, settings))
-        if curves and settings.num_pictures:
-            write_error_curve(run_dir / f"error_curve_{split}.png", curves, frame_dt)
+            files.add(scene, about)
+        files.finish()
+        films += files.films
     write_models(run_dir, members_of(simulator)[0], label, films, settings.export)
     write_cost(run_dir, predictor.seconds, frame_dt)
     write_rows(run_dir / "metrics.csv", rows)
@@ -132,15 +119,6 @@ def _as_evaluated(simulator: LearnedSimulator | LearnedEnsemble, settings: Evalu
         static_friction=settings.static_friction,
         mirror_average=settings.mirror_average,
     )
-
-
-def _draw(run_dir: Path, scene: PredictedScene, split: str, number: int, label: str, settings: EvaluationSettings) -> SolverFilm:
-    """Write pictures and exports of a scene. Return the film of its solver for the page."""
-    write_pictures(run_dir, split, number, scene.truth, {label: scene.predictions[label]})
-    write_exports(run_dir, split, number, scene.truth, scene.predictions[label], settings.export)
-    if scene.at_values:
-        write_parameter_picture(run_dir / f"parameters_{split}_{number:02d}.png", scene.at_values)
-    return SolverFilm(f"{split} {number}", scene.trajectory)
 
 
 def _rows(scene: PredictedScene, about: About, label: str, horizons: dict[int, str]) -> Iterator[Row]:

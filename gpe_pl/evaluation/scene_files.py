@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.material_controls import AtValue
@@ -25,6 +28,10 @@ log = logging.getLogger(__name__)
 
 VIEWER_BYTES = 2**26
 """Maximum size of a viewer's arrays before compression [bytes]; the viewer of a longer rollout skips frames."""
+
+
+VECTOR: tuple[Export, ...] = ("svg", "pdf")
+"""Formats in which figures are written beside PNG."""
 
 
 class ExportError(GpeError):
@@ -63,31 +70,39 @@ def check_scene(settings: EvaluationSettings, trajectory: Trajectory) -> None:
         refuse_rigid_bodies(trajectory.rigid_body)
 
 
-def write_pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predictions: dict[str, Trajectory]) -> None:
+def save(figure: Figure, path: Path, formats: Sequence[Export], **options: Any) -> None:
+    """Write a figure as PNG, and beside it as SVG or PDF if the ``formats`` name these. Options are those of ``savefig``."""
+    for suffix in (".png", *(f".{kind}" for kind in VECTOR if kind in formats)):
+        save_figure(figure, path.with_suffix(suffix), **{"dpi": 150, **options})
+
+
+def write_pictures(
+    run_dir: Path, split: str, number: int, truth: Trajectory, predictions: dict[str, Trajectory], formats: Sequence[Export] = ()
+) -> None:
     """Write a figure, an animation and a viewer of a scene to ``run_dir``, and a figure of the stress if all trajectories have one.
 
-    ``split`` and ``number`` of the scene are part of the files' names. ``predictions`` are rollouts by model.
+    ``split`` and ``number`` of the scene are part of the files' names. ``predictions`` are rollouts by model. ``formats`` may ask for figures as SVG or PDF.
     """
     from gpe_pl.viz.figures import rollout_figure
     from gpe_pl.viz.video import write_animation
     from gpe_pl.viz.viewer import write_viewer
 
     stem = run_dir / f"rollout_{split}_{number:02d}"
-    save_figure(rollout_figure(truth, predictions), stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
+    save(rollout_figure(truth, predictions), stem.with_suffix(".png"), formats, bbox_inches="tight")
     if truth.stress is not None and all(p.stress is not None for p in predictions.values()):
         figure = rollout_figure(truth, predictions, color="von_mises")
-        save_figure(figure, run_dir / f"stress_{split}_{number:02d}.png", dpi=150, bbox_inches="tight")
+        save(figure, run_dir / f"stress_{split}_{number:02d}.png", formats, bbox_inches="tight")
     stride = max(1, truth.num_frames // 60)
     write_animation(stem.with_suffix(".gif"), truth, predictions, fps=20, stride=stride)
     size = (1 + len(predictions)) * (truth.pos.nbytes + truth.vel.nbytes)
     write_viewer(stem.with_suffix(".html"), truth, predictions, stride=-(-size // VIEWER_BYTES))
 
 
-def write_parameter_picture(path: Path, scenes: list[AtValue]) -> None:
+def write_parameter_picture(path: Path, scenes: list[AtValue], formats: Sequence[Export] = ()) -> None:
     """Draw a scene at several values of its material parameters."""
     from gpe_pl.viz.figures import parameter_strip
 
-    save_figure(parameter_strip(scenes), path, dpi=150, bbox_inches="tight")
+    save(parameter_strip(scenes), path, formats, bbox_inches="tight")
 
 
 def write_exports(run_dir: Path, split: str, number: int, truth: Trajectory, prediction: Trajectory, formats: list[Export]) -> None:
@@ -122,8 +137,8 @@ def write_models(run_dir: Path, simulator: LearnedSimulator, label: str, films: 
         write_page(run_dir / "page", {label: simulator}, {label: films})
 
 
-def write_error_curve(path: Path, curves: dict[str, list[np.ndarray]], frame_dt: float) -> None:
+def write_error_curve(path: Path, curves: dict[str, list[np.ndarray]], frame_dt: float, formats: Sequence[Export] = ()) -> None:
     """Draw the error against time. ``curves`` has the position error of each frame [m²], for each model and scene."""
     from gpe_pl.viz.figures import error_curve_figure
 
-    save_figure(error_curve_figure(curves, frame_dt), path, dpi=150)
+    save(error_curve_figure(curves, frame_dt), path, formats)

@@ -10,7 +10,7 @@ from pydantic import Field
 from gpe_pl.errors import GpeError
 from gpe_pl.schema import Split
 
-Export = Literal["vtk", "npz", "mp4", "model", "onnx", "page"]
+Export = Literal["vtk", "npz", "mp4", "svg", "pdf", "model", "onnx", "page"]
 
 
 class StartError(GpeError, ValueError):
@@ -35,9 +35,11 @@ class EvaluationSettings:
         mirror_average: average each step over the scene and its mirror images (see ``learned.mirror_average``); None takes the model's own value.
         material_controls: roll scenes with unseen parameters out with other parameters, too (see ``material_controls``).
         num_pictures: number of trajectories per split that get a figure, an animation and a viewer. With 0, no curve of errors is drawn, either.
-        export: what to write for other programs: the trajectories with pictures as ``vtk`` series, ``npz`` and ``mp4``, the ``model`` (see
-            ``export.program``), its network as ``onnx`` (see ``export.onnx_network``), and a ``page`` on which the model runs in a browser (see
-            ``export.play_page``), with films of these trajectories.
+        quantities: also write energy, momentum, run-out, bounce height and peak stress (see ``metrics.quantities``): over time for the trajectories with
+            pictures, and one number per trajectory as a table and parity plots.
+        export: what to write for other programs: the trajectories with pictures as ``vtk`` series, ``npz`` and ``mp4``, figures also as ``svg`` or ``pdf``,
+            the ``model`` (see ``export.program``), its network as ``onnx`` (see ``export.onnx_network``), and a ``page`` on which the model runs in a
+            browser (see ``export.play_page``), with films of these trajectories.
     """
 
     splits: Annotated[list[Split], Field(min_length=1)] = field(default_factory=lambda: ["test", "test_unseen"])
@@ -51,6 +53,7 @@ class EvaluationSettings:
     mirror_average: bool | None = None
     material_controls: bool = False
     num_pictures: Annotated[int, Field(ge=0)] = 2
+    quantities: bool = False
     export: list[Export] = field(default_factory=list)
 
     def first_frame(self, history: int, frame_dt: float) -> int:

@@ -231,15 +231,26 @@ def _relative(error: np.ndarray, reference: np.ndarray) -> float:
 
 
 @dataclass(frozen=True)
-class _Motion:
-    """Quantities per mass of frames 1, 2, …: momentum [m/s], angular momentum about the centre of mass [m²/s], kinetic energy [J/kg]."""
+class MassMotion:
+    """Quantities per mass of frames 1, 2, …
+
+    Attributes:
+        momentum: momentum [m/s].
+        angular_momentum: angular momentum about the centre of mass [m²/s].
+        kinetic_energy: kinetic energy [J/kg].
+        pos: positions [m], undivided by the seams of a periodic domain.
+        centre: centre of mass [m].
+    """
 
     momentum: Float[np.ndarray, "frame dim"]
     angular_momentum: Float[np.ndarray, "frame dim dim"]
     kinetic_energy: Float[np.ndarray, "frame"]
+    pos: Float[np.ndarray, "frame node dim"]
+    centre: Float[np.ndarray, "frame dim"]
 
 
-def _motion(trajectory: Trajectory, num_steps: int) -> _Motion:
+def mass_motion(trajectory: Trajectory, num_steps: int) -> MassMotion:
+    """Return the motion of all nodes of a trajectory in frames 1 to ``num_steps``, with velocities (x[t] − x[t−1]) / Δt."""
     pos, dt = trajectory.pos[: num_steps + 1].astype(np.float64), trajectory.metadata.frame_dt
     if any(trajectory.metadata.periodic):  # unwrap, so that crossing the seam is not a jump
         steps = displacement(pos[1:], pos[:-1], trajectory.metadata)
@@ -247,13 +258,14 @@ def _motion(trajectory: Trajectory, num_steps: int) -> _Motion:
     vel, pos = integrators.velocities(pos, dt), pos[1:]
     fraction = trajectory.mass.astype(np.float64) / trajectory.mass.sum(dtype=np.float64)
     momentum = np.einsum("n,fnd->fd", fraction, vel)
-    arm = pos - np.einsum("n,fnd->fd", fraction, pos)[:, None]
+    centre = np.einsum("n,fnd->fd", fraction, pos)
+    arm = pos - centre[:, None]
     moment = np.einsum("n,fni,fnj->fij", fraction, arm, vel)
-    return _Motion(momentum, moment - moment.swapaxes(1, 2), 0.5 * np.einsum("n,fnd,fnd->f", fraction, vel, vel))
+    return MassMotion(momentum, moment - moment.swapaxes(1, 2), 0.5 * np.einsum("n,fnd,fnd->f", fraction, vel, vel), pos, centre)
 
 
 def _motion_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: int) -> dict[str, float]:
-    p, g = _motion(prediction, num_steps), _motion(ground_truth, num_steps)
+    p, g = mass_motion(prediction, num_steps), mass_motion(ground_truth, num_steps)
     energy = p.kinetic_energy - g.kinetic_energy
     # Relative to the largest ground-truth energy up to the horizon, because material at rest has none.
     scale = g.kinetic_energy.max()

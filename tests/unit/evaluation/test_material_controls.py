@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gpe_pl.config.datasets import dataset_spec
-from gpe_pl.evaluation import rollouts
+from gpe_pl.evaluation import split_files
 from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, ControlError, MaterialControls, label_of
 from gpe_pl.evaluation.metric_rows import Row
 from gpe_pl.evaluation.predictions import start_of
@@ -87,7 +87,7 @@ def test_pictured_scenes_are_at_three_values_in_ascending_order(controls: Materi
 
 def test_controls_give_a_picture_of_three_values(controls: MaterialControls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for other in ("write_pictures", "write_error_curve"):
-        monkeypatch.setattr(rollouts, other, lambda *_: None)
+        monkeypatch.setattr(split_files, other, lambda *_: None)
     evaluate(simulator(controls.root, "affine"), controls.root, replace(SETTINGS, num_pictures=1), tmp_path, controls=controls)
     assert [path.name for path in tmp_path.glob("*.png")] == ["parameters_test_unseen_00.png"]
 

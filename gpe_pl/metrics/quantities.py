@@ -1,0 +1,87 @@
+"""Quantities that an engineer asks of a scene: energy, momentum, run-out, bounce height and peak stress, over time and as one number per scene.
+
+Velocities are those of the frames, (x[t] − x[t−1]) / Δt, in predictions and ground truth alike. In 2D, energies, momenta and masses are per metre of depth.
+Axes without gravity are horizontal. In scenes without gravity all axes are, and there is no height.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from gpe_pl.metrics.deformation import strain_energy
+from gpe_pl.metrics.rollouts import mass_motion
+from gpe_pl.trajectory.state import von_mises
+from gpe_pl.trajectory.trajectory import Trajectory
+
+RUN_OUT_FRACTION = 0.95
+"""Fraction of the mass within the run-out. The farthest node alone would be chance."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity of one scene.
+
+    Attributes:
+        unit: unit of the values.
+        over_time: values of frames 1, 2, … [frame].
+        value: the number of the scene that parity plots compare; None if only the course is of interest.
+    """
+
+    unit: str
+    over_time: Float[np.ndarray, "frame"]
+    value: float | None = None
+
+
+def quantities(trajectory: Trajectory) -> dict[str, Quantity]:
+    """Return the quantities of a trajectory of at least two frames, by name.
+
+    - ``kinetic energy``, ``potential energy`` (0 in frame 1), ``elastic energy`` where ``strain_energy`` knows it [J].
+    - ``momentum``: magnitude of the total momentum [kg m/s].
+    - ``run-out``: horizontal distance from the first centre of mass within which ``RUN_OUT_FRACTION`` of the mass is [m]; one number: at the end.
+    - ``height``: height of the centre of mass above that in frame 1 [m].
+    - ``bounce height``: rise of the centre of mass above its lowest earlier place, since it began to fall [m]; one number: the largest.
+    - ``peak stress``: largest von Mises stress of a node [Pa], where there is a stress; one number: the largest.
+    """
+    motion = mass_motion(trajectory, trajectory.num_frames - 1)
+    mass, gravity = float(trajectory.mass.sum(dtype=np.float64)), np.asarray(trajectory.metadata.gravity, float)
+    found = {
+        "kinetic energy": Quantity("J", mass * motion.kinetic_energy),
+        "momentum": Quantity("kg m/s", mass * np.linalg.norm(motion.momentum, axis=-1)),
+    }
+    energy = strain_energy(trajectory)
+    if energy is not None:
+        found["elastic energy"] = Quantity("J", energy[1:])
+    out = _run_out(motion.pos, motion.centre[0], trajectory.mass, gravity == 0)
+    found["run-out"] = Quantity("m", out, float(out[-1]))
+    strength = float(np.linalg.norm(gravity))
+    if strength:
+        height = (motion.centre - motion.centre[0]) @ (-gravity / strength)
+        rise = _rise(height)
+        found["potential energy"] = Quantity("J", mass * strength * height)
+        found["height"] = Quantity("m", height)
+        found["bounce height"] = Quantity("m", rise, float(rise.max()))
+    if trajectory.stress is not None:
+        peak = von_mises(np.asarray(trajectory.stress.node[1:], np.float64)).max(axis=1)
+        found["peak stress"] = Quantity("Pa", peak, float(peak.max()))
+    return found
+
+
+def _run_out(
+    pos: Float[np.ndarray, "frame node dim"], start: Float[np.ndarray, "dim"], mass: Float[np.ndarray, "node"], horizontal: np.ndarray
+) -> Float[np.ndarray, "frame"]:
+    distance = np.linalg.norm((pos - start)[..., horizontal], axis=-1)
+    order = np.argsort(distance, axis=1)
+    within = np.cumsum(mass.astype(np.float64)[order], axis=1) / mass.sum(dtype=np.float64)
+    node = np.argmax(within >= RUN_OUT_FRACTION - 1e-12, axis=1)
+    return np.take_along_axis(np.take_along_axis(distance, order, axis=1), node[:, None], axis=1)[:, 0]
+
+
+def _rise(height: Float[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
+    """Return the rise above the lowest earlier height in each frame; 0 until the height first decreases."""
+    falls = np.diff(height, prepend=height[0]) < 0
+    begun = np.logical_or.accumulate(falls)
+    lowest = np.minimum.accumulate(np.where(begun, height, np.inf))
+    return np.where(begun, height - np.where(begun, lowest, 0.0), 0.0)
