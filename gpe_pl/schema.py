@@ -201,6 +201,7 @@ Values = Literal[
     "parameters",  # finite if the node's material has the parameter, and positive if its scale is logarithmic
     "nodes of cells",  # rows of nodes; the number of different nodes is that of a kind of cell
     "numbers of bodies",  # −1 for none
+    "one stretch",  # 0 or 1, and 1 in consecutive frames only
     "dimension of cells",  # 2 or 3, and at most the dimension of space
 ]
 """Rules for the values of stored arrays. ``gpe_pl.trajectory.values`` checks them."""
@@ -257,6 +258,15 @@ FIELDS: dict[str, Field] = {
         ("boundary_node",), "float32", "1", "fraction of the normal velocity that a bounce returns", values="0 to 1"
     ),
     "rest_pos": Field(("node", "dim"), "float32", "m", "undeformed positions of mesh nodes", required=False),
+    "alive": Field(
+        ("frame", "node"),
+        "uint8",
+        "1",
+        "1 in the frames in which a node is in an open scene, which nodes enter and leave; in other frames its position and velocity have no meaning; "
+        "without this field every node is in the scene in every frame",
+        required=False,
+        values="one stretch",
+    ),
     "rigid_body": Field(
         ("node",),
         "int32",

@@ -216,6 +216,8 @@ def damage(trajectory: Trajectory) -> str | None:
     pos, metadata = trajectory.pos, trajectory.metadata
     if trajectory.num_nodes == 0:
         return "it has no nodes"
+    if trajectory.alive is not None:
+        return "its nodes enter and leave, and models learn from scenes whose nodes stay"
     bounds = np.array(metadata.bounds)
     width = np.ptp(bounds, axis=1)
     low, high = (

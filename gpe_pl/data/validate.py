@@ -31,13 +31,16 @@ from gpe_pl.files.json_text import parsed
 from gpe_pl.geometry.shape_values import shapes_fault
 from gpe_pl.geometry.shapes import Shape
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
+from gpe_pl.trajectory.openings import openings_fault
 from gpe_pl.trajectory.store import (
     StoreError,
     digest,
+    digested_attributes,
     metadata_of,
     node_types_of,
     open_group,
     open_shard,
+    openings_of,
     read_field,
     read_text,
     shapes_of,
@@ -108,6 +111,9 @@ class Group:
         self.low, self.high = np.minimum(self.low, pos.min((0, 1))), np.maximum(self.high, pos.max((0, 1)))
         for name, column in zip(metadata.param_names, arrays["material_params"].T, strict=True):
             self.params.setdefault(name, set()).update(np.unique(column[~np.isnan(column)]).tolist())
+        if "alive" in arrays:  # nodes enter with a prescribed velocity, so accelerations and free groups say nothing about the solver
+            self.flights.append(joined([], metadata.dim))
+            return
         self.flights.append(joined(free_flights(metadata, arrays), metadata.dim))
         if len(pos) > 2:
             motion = motion_of(metadata, pos)
@@ -240,7 +246,8 @@ def _check_shard(file: h5py.File) -> Iterator[Finding]:
     except ValueError as error:
         yield "units", f"is not JSON: {error}"
     else:
-        if units != expected:
+        optional = {key for key, spec in FIELDS.items() if not spec.required}  # files from before an optional field was introduced lack it
+        if not isinstance(units, dict) or {**expected, **units} != expected or not expected.keys() - optional <= units.keys():
             yield "units", "differ from those of the schema; the store is in SI units"
 
 
@@ -263,7 +270,7 @@ def _check_trajectory(group: h5py.Group, path: Path) -> tuple[Metadata, dict[str
     conflicts = size_conflicts(arrays, metadata.dim, len(metadata.param_names))
     findings += [("", conflict) for conflict in conflicts]
     sha = read_text(group, "sha256")
-    if digest(arrays, {key: read_text(group, key) for key in ("metadata", "shapes", "node_types")}) != sha:
+    if digest(arrays, digested_attributes(group)) != sha:
         findings.append(("sha256", "does not match the content; delete the shard and generate or import the data again"))
     complete = all(key in arrays for key, spec in FIELDS.items() if spec.required)
     if complete and not conflicts:  # the following checks need consistent shapes
@@ -275,6 +282,8 @@ def _check_trajectory(group: h5py.Group, path: Path) -> tuple[Metadata, dict[str
             findings += _check_parameters(metadata, arrays, names)
         findings += _check_motion(metadata, arrays)
         findings += _check_shapes(metadata, arrays, shapes_of(group), "boundary_pos" not in wrong)
+        if (fault := openings_fault(openings_of(group), metadata.dim, len(metadata.param_names), len(names))) is not None:
+            findings.append(("openings", fault))
     return metadata, arrays, sha, findings
 
 
@@ -398,7 +407,7 @@ Schema version {version}. There is one HDF5 file per shard and one group per tra
     attributes: schema_version, units (JSON), num_trajectories
     00000/  00001/  …                      one trajectory each
         attributes: metadata (JSON), shapes (JSON), node_types (JSON), sha256; start_time (JSON, s) if the trajectory begins later than
-                    its scene; prediction if a model predicted it
+                    its scene; openings (JSON) if the scene has inlets and outlets; prediction if a model predicted it
         pos  vel  …                        fields, each with an attribute unit
 ```
 

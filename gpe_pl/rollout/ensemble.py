@@ -45,6 +45,10 @@ class Ensemble:
 
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
         """Return the mean states one frame later. A scene in which a member fails has the error of the first that does."""
+        if any(state.openings for state in states):
+            raise SimulationError(
+                "an ensemble cannot predict open scenes, because its members would lose the nodes that enter", reason="input"
+            )
         before = [self._states_of(state) for state in states]
         columns = [step_all(member, [own[k] for own in before]) for k, member in enumerate(self.members)]
         return [self._combined(items) for items in zip(*columns, strict=True)]

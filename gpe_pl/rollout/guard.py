@@ -99,7 +99,7 @@ class Guard:
         if bool(xp.all(finite)):
             return None
         node = int(xp.argmax(xp.astype(~finite, xp.int8)))
-        return Termination("nan", frame, node, f"frame {frame}: node {node} has a position or velocity that is not finite")
+        return _stopped("nan", frame, state, node, "has a position or velocity that is not finite")
 
     def _escape(self, state: State, frame: int) -> Termination | None:
         xp = array_namespace(state.pos)
@@ -107,7 +107,7 @@ class Guard:
             outside = xp.maximum(low - state.pos[:, axis], state.pos[:, axis] - high)
             if float(xp.max(outside)) > self.margin:
                 node = int(xp.argmax(outside))
-                return Termination("escape", frame, node, f"frame {frame}: node {node} is {float(outside[node]):.3g} m outside the domain")
+                return _stopped("escape", frame, state, node, f"is {float(outside[node]):.3g} m outside the domain")
         return None
 
     def _explosion(self, state: State, frame: int) -> Termination | None:
@@ -118,16 +118,15 @@ class Guard:
         if float(xp.max(speed)) <= self.max_speed:
             return None
         node = int(xp.argmax(speed))
-        text = f"frame {frame}: node {node} moves at {float(speed[node]):.3g} m/s, limit {self.max_speed:.3g} m/s"
-        return Termination("explosion", frame, node, text)
+        return _stopped("explosion", frame, state, node, f"moves at {float(speed[node]):.3g} m/s, limit {self.max_speed:.3g} m/s")
 
     def _clustering(self, state: State, frame: int) -> Termination | None:
         counts = crowding(as_numpy(state.pos), self.spacing)
         if counts.max() <= self.max_crowding:
             return None
         node = int(np.argmax(counts))
-        text = f"frame {frame}: node {node} shares a box as wide as the spacing with {counts.max() - 1} others, limit {self.max_crowding}"
-        return Termination("clustering", frame, node, text)
+        text = f"shares a box as wide as the spacing with {counts.max() - 1} others, limit {self.max_crowding}"
+        return _stopped("clustering", frame, state, node, text)
 
     def _tunnelling(self, before: State | None, state: State, frame: int) -> Termination | None:
         """Find nodes deeper than ``margin`` in a wall or obstacle, and nodes that passed through one: outside in both frames, but inside on the way."""
@@ -137,12 +136,10 @@ class Guard:
         distance = signed_distance(shapes, end)
         node = int(np.argmin(distance))
         if 0 < self.margin < -distance[node]:
-            return Termination(
-                "tunnelling", frame, node, f"frame {frame}: node {node} is {-distance[node]:.3g} m deep in a wall or obstacle"
-            )
+            return _stopped("tunnelling", frame, state, node, f"is {-distance[node]:.3g} m deep in a wall or obstacle")
         if before is None:
             return None
-        start, tolerance = as_numpy(before.pos), TUNNEL_DEPTH * self.spacing
+        start, tolerance = _starts(before, state), TUNNEL_DEPTH * self.spacing
         way = state.periodicity.shortest(end - start)
         length = np.sqrt(np.einsum("nd,nd->n", way, way))
         if not length.max() > 2 * tolerance:
@@ -157,8 +154,7 @@ class Guard:
         node = int(np.argmax(deepest))
         if not deepest[node] > tolerance:
             return None
-        text = f"frame {frame}: node {node} went {deepest[node]:.3g} m deep through a wall or obstacle within one frame"
-        return Termination("tunnelling", frame, node, text)
+        return _stopped("tunnelling", frame, state, node, f"went {deepest[node]:.3g} m deep through a wall or obstacle within one frame")
 
     def _is_far_from_tunnelling(self, before: State | None, state: State) -> bool:
         """Tell in one compiled pass whether no node can have tunnelled: none is deep in a shape, and none has moved farther than through a thin wall."""
@@ -166,7 +162,7 @@ class Guard:
         if state.periodicity or not has_compiled_distance(shapes):
             return False
         pos = np.ascontiguousarray(as_numpy(state.pos), np.float64)
-        start = pos if before is None else np.ascontiguousarray(as_numpy(before.pos), np.float64)
+        start = pos if before is None else np.ascontiguousarray(_starts(before, state), np.float64)
         deepest = self.margin if self.margin > 0 else math.inf
         return are_near(shapes, start, pos, 2 * TUNNEL_DEPTH * self.spacing, deepest)
 
@@ -182,6 +178,22 @@ class Guard:
         if crowding(pos, FINEST * self.spacing).max() > self.max_crowding:
             return self
         return replace(self, max_crowding=max(self.max_crowding, 2 * int(crowding(pos, self.spacing).max())))
+
+
+def _stopped(reason: str, frame: int, state: State, row: int, what: str) -> Termination:
+    """Return the reason for a stop that the node in a row shows."""
+    node = state.identity(row)
+    return Termination(reason, frame, node, f"frame {frame}: node {node} {what}")
+
+
+def _starts(before: State, state: State) -> np.ndarray:
+    """Return the position of each node one frame earlier [node, dim] in m. Nodes that entered in between have their present position."""
+    if state.node_id is None or before.node_id is None:
+        return as_numpy(before.pos)
+    start, earlier, now = np.array(as_numpy(state.pos)), as_numpy(before.node_id), as_numpy(state.node_id)
+    was_there = np.isin(now, earlier)
+    start[was_there] = as_numpy(before.pos)[np.searchsorted(earlier, now[was_there])]
+    return start
 
 
 def _depth_through(shapes: tuple[Shape, ...], start: np.ndarray, way: np.ndarray, count: int, tolerance: float) -> np.ndarray:

@@ -15,8 +15,10 @@ import numpy as np
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.shapes import signed_distance
+from gpe_pl.rollout.flow import through_openings
 from gpe_pl.rollout.guard import Guard, unsound
 from gpe_pl.trajectory.boundary import BoundaryMotion, as_numpy
+from gpe_pl.trajectory.living import columns
 from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
 
@@ -68,13 +70,16 @@ class SimulationError(GpeError, RuntimeError):
 
 @dataclass(frozen=True)
 class Replay:
-    """A simulator that returns the frames of a stored trajectory, chosen by the time of the state. After the last frame, ``step`` raises ``IndexError``."""
+    """A simulator that returns the frames of a stored trajectory, chosen by the time of the state. After the last frame, ``step`` raises ``IndexError``.
+
+    States of an open scene have the nodes of the stored frame, so they have no openings that would change them.
+    """
 
     trajectory: Trajectory
 
     def step(self, state: State) -> State:
         frame = round((state.time - self.trajectory.start_time) / self.trajectory.metadata.frame_dt) + 1
-        return self.trajectory.state(frame)
+        return replace(self.trajectory.state(frame), openings=())
 
 
 def sound(after: State | SimulationError) -> State:
@@ -200,6 +205,8 @@ def step_scenes(
         if not live:
             return
         for scene, item in zip(list(live), step_all(simulator, list(live.values())), strict=True):
+            if isinstance(item, State) and item.openings:
+                item = through_openings(live[scene], item)
             stop = _termination(item, frame, (guards or {}).get(scene), live[scene])
             if stop is None:
                 live[scene] = cast(State, item)
@@ -210,7 +217,9 @@ def step_scenes(
 
 def _termination(item: State | SimulationError, frame: int, guard: Guard | None, before: State) -> Termination | None:
     if isinstance(item, SimulationError):
-        return Termination(item.reason, frame, item.node, f"frame {frame}: {item}")
+        node = item.node if item.node < 0 else before.identity(item.node)
+        which = "" if node == item.node else f" (node {node} of the whole rollout)"
+        return Termination(item.reason, frame, node, f"frame {frame}: {item}{which}")
     return None if guard is None else guard.check(item, frame, before)
 
 
@@ -244,6 +253,8 @@ class _Recording:
         self.frame_velocity: list[np.ndarray | None] = []
         self.stress: list[Stress | None] = []
         self.motion: list[BoundaryMotion] = []
+        self.ids: list[np.ndarray] = []
+        self.entered: list[State] = []
         self.termination: Termination | None = None
         self.add(start.state)
 
@@ -257,7 +268,18 @@ class _Recording:
         if self.start.state.boundary.motion is not None:
             b = item.boundary
             self.motion.append(BoundaryMotion(*(np.array(_numpy(x)) for x in (b.pos, b.vel, b.normal))))
+        if item.node_id is not None:
+            self._note_identities(item)
         self.stress.append(None if item.stress is None else Stress(_numpy(item.stress.node), _numpy(item.stress.cell)))
+
+    def _note_identities(self, state: State) -> None:
+        """Keep the identities of the nodes, and the nodes that were not in the scene before, which differ only in what never changes."""
+        ids = _numpy(state.node_id)
+        known = self.ids[-1] if self.ids else ids[:0]
+        new = np.flatnonzero(~np.isin(ids, known))
+        if len(new) or not self.entered:
+            self.entered.append(state.take(new))
+        self.ids.append(ids)
 
     def _velocities(self) -> list[np.ndarray]:
         """Return the velocities at the frames if the simulator knows them, otherwise the mean velocities over the frames before."""
@@ -268,7 +290,13 @@ class _Recording:
         return [self.vel[0] if first is None else first, *known]
 
     def trajectory(self) -> Trajectory:
-        state = self.start.state
+        state, alive = self.start.state, None
+        if self.ids:
+            state = State.joined(self.entered) if len(self.entered) > 1 else self.entered[0]
+            state = state.take(np.argsort(_numpy(state.node_id)))  # as in ``columns``
+            (pos, alive, _), (vel, _, _) = columns(self.ids, self.pos), columns(self.ids, self._velocities())
+        else:
+            pos, vel = np.stack(self.pos), np.stack(self._velocities())
         known = [stress for stress in self.stress if stress is not None]
         has_stress = len(known) == len(self.stress)
         motion = (
@@ -278,19 +306,21 @@ class _Recording:
         )
         return Trajectory(
             self.start.metadata,
-            np.stack(self.pos),
-            np.stack(self._velocities()),
+            pos,
+            vel,
             _numpy(state.node_type),
             _numpy(state.mass),
             _numpy(state.material_params),
-            replace(state.boundary.to_numpy(), motion=motion),
+            replace(self.start.state.boundary.to_numpy(), motion=motion),
             rest_pos=None if state.rest_pos is None else _numpy(state.rest_pos),
             cells=None if state.cells is None else _numpy(state.cells),
             cell_dim=state.cell_dim,
             rigid_body=None if state.rigid_body is None else _numpy(state.rigid_body),
             stress=Stress(np.stack([s.node for s in known]), np.stack([s.cell for s in known])) if has_stress else None,
             termination=self.termination,
-            start_time=state.time,
+            alive=alive,
+            openings=self.start.state.openings,
+            start_time=self.start.state.time,
             is_prediction=self.is_prediction,
         )
 

@@ -9,8 +9,13 @@ from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 
 
-def check_surroundings(state: State, solver: str) -> None:
+def check_surroundings(state: State, solver: str, computes_open_scenes: bool = False) -> None:
     """Raise an error for surroundings that a solver would otherwise ignore silently.
+
+    Args:
+        state: state of the scene.
+        solver: name of the solver.
+        computes_open_scenes: whether it computes scenes with inlets and outlets.
 
     Raises:
         SimulationError: with reason ``input``. The message names the solver and what it does not compute.
@@ -18,6 +23,8 @@ def check_surroundings(state: State, solver: str) -> None:
     if state.periodicity:
         axes = ", ".join("xyz"[axis] for axis in state.periodicity.axes)
         raise SimulationError(f"{solver} does not compute periodic domains; the scene repeats along {axes}", reason="input")
+    if state.openings and not computes_open_scenes:
+        raise SimulationError(f"{solver} does not compute scenes with inlets and outlets; FLIP does, for liquids", reason="input")
     b = state.boundary
     if _moves(b) or np.any(np.asarray(b.restitution) != 0):
         raise SimulationError(f"{solver} supports only boundaries at rest and without restitution", reason="input")

@@ -14,6 +14,7 @@ from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.trajectory.arrays import ArrayError
 from gpe_pl.trajectory.boundary import Array, Boundary
 from gpe_pl.trajectory.kinds import CELL, GROUP, NODE, SCENE, STEP, names_of
+from gpe_pl.trajectory.openings import Opening
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,9 @@ class State:
         rigid_body: number of the rigid body that each node belongs to, −1 for none [node]; None if the scene has no rigid bodies. See ``rigid_bodies``.
         param_names: names of the columns of ``material_params``; empty stands for the first parameter of each material of the data set. Solvers take the
             values of parameters without a column from their settings.
+        openings: inlets and outlets. The arrays of a state have the nodes that are in the scene now, so their number changes in an open scene.
+        node_id: identities of the nodes [node], ascending, which stay the same while nodes enter and leave; None in scenes that are not open.
+        next_id: identity of the next node that enters.
     """
 
     pos: Array = field(metadata=NODE)
@@ -106,6 +110,9 @@ class State:
     periodicity: Periodicity = field(default=NOWHERE, metadata=SCENE)
     param_names: tuple[str, ...] = field(default=(), metadata=SCENE)
     rigid_body: Array | None = field(default=None, metadata=GROUP)
+    openings: tuple[Opening, ...] = field(default=(), metadata=SCENE)
+    node_id: Array | None = field(default=None, metadata=NODE)
+    next_id: int = field(default=0, metadata=SCENE)
 
     @property
     def num_nodes(self) -> int:
@@ -114,6 +121,18 @@ class State:
     @property
     def dim(self) -> int:
         return self.pos.shape[1]
+
+    def identity(self, row: int) -> int:
+        """Return the identity of the node in a row; the row itself in scenes that are not open."""
+        return row if self.node_id is None else int(self.node_id[row])
+
+    def opened(self, openings: Sequence[Opening]) -> State:
+        """Return the state with openings. Nodes get their row numbers as identities, unless they have some."""
+        if self.node_id is not None:
+            return replace(self, openings=tuple(openings))
+        xp = array_namespace(self.pos)
+        node_id = xp.arange(self.num_nodes, dtype=xp.int64, device=device(self.pos))
+        return replace(self, openings=tuple(openings), node_id=node_id, next_id=self.num_nodes)
 
     def take(self, nodes: Array) -> State:
         """Return some of the nodes, in the given order, and the cells that have all their corners among them.

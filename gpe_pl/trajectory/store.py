@@ -31,6 +31,7 @@ from gpe_pl.geometry.shape_values import shape_from_dict, shape_to_dict, shapes_
 from gpe_pl.geometry.shapes import Shape
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
+from gpe_pl.trajectory.openings import Opening, openings_fault, openings_from_json, openings_to_json
 from gpe_pl.trajectory.state import Stress
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from gpe_pl.trajectory.values import faults, size_conflicts
@@ -67,6 +68,7 @@ def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
         "boundary_friction": b.friction,
         "boundary_restitution": b.restitution,
         "rest_pos": trajectory.rest_pos,
+        "alive": trajectory.alive,
         "rigid_body": trajectory.rigid_body,
         "cells": trajectory.cells,
         "cell_dim": None if trajectory.cells is None or trajectory.cell_dim is None else [trajectory.cell_dim],
@@ -90,8 +92,12 @@ PREDICTION = "prediction"
 START_TIME = "start_time"
 """Name of the attribute with the time of the first frame [s]. Only trajectories that start later than their scene have it: solvers do not assume that their
 first frame is undeformed."""
+OPENINGS = "openings"
+"""Name of the attribute with the inlets and outlets of an open scene."""
 ATTRIBUTES = ("metadata", "shapes", "node_types")
 """Attributes of every trajectory's group, besides the digest."""
+FURTHER = (START_TIME, OPENINGS)
+"""Attributes that some trajectories have, and that the digest covers."""
 
 
 OPTIONAL = ("stress_materials",)
@@ -99,13 +105,21 @@ OPTIONAL = ("stress_materials",)
 
 
 def stored_attributes(trajectory: Trajectory) -> dict[str, str]:
-    """Return the attributes of a trajectory as JSON: metadata, shapes of its boundary, names of the ``node_type`` codes, and a start time other than 0."""
+    """Return the attributes of a trajectory as JSON: metadata, shapes of its boundary, names of the ``node_type`` codes, and, if there are some, a start time
+    other than 0 and openings.
+    """
     m = trajectory.metadata
     values = {name: value for name, value in asdict(m).items() if name not in OPTIONAL or value is not None}
     meta = json.dumps(values, sort_keys=True)
     shapes = json.dumps([shape_to_dict(s) for s in trajectory.boundary.shapes], sort_keys=True)
     begins = {START_TIME: repr(float(trajectory.start_time))} if trajectory.start_time else {}
-    return {"metadata": meta, "shapes": shapes, "node_types": json.dumps(NODE_TYPES), **begins}
+    opens = {OPENINGS: openings_to_json(trajectory.openings)} if trajectory.openings else {}
+    return {"metadata": meta, "shapes": shapes, "node_types": json.dumps(NODE_TYPES), **begins, **opens}
+
+
+def digested_attributes(group: h5py.Group) -> dict[str, str]:
+    """Return the attributes of a trajectory's group that its digest covers."""
+    return {key: read_text(group, key) for key in (*ATTRIBUTES, *(key for key in FURTHER if key in group.attrs))}
 
 
 def digest(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
@@ -323,6 +337,18 @@ def start_time_of(group: h5py.Group) -> float:
     return float(seconds)
 
 
+def openings_of(group: h5py.Group) -> tuple[Opening, ...]:
+    """Return the inlets and outlets of a trajectory's group; their values are not checked."""
+    if OPENINGS not in group.attrs:
+        return ()
+    try:
+        return openings_from_json(read_text(group, OPENINGS))
+    except StoreError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise StoreError(f"{_where(group)}: attribute {OPENINGS!r} is unreadable: {error}; {ADVICE}") from None
+
+
 def node_types_of(group: h5py.Group) -> tuple[str, ...]:
     """Return the names of the ``node_type`` codes in a trajectory's group; all of them are in ``schema.NODE_TYPES``."""
     try:
@@ -359,18 +385,19 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         metadata = metadata_of(group)
         arrays = {key: read_field(group, key, frames) for key, spec in FIELDS.items() if spec.required or is_named(group, key)}
         first_frame = 0 if frames is None else frames.indices(open_field(group, "pos").shape[0])[0]
-        if verify:
-            attributes = {key: read_text(group, key) for key in (*ATTRIBUTES, START_TIME) if key in (*ATTRIBUTES, *group.attrs)}
-            if digest(arrays, attributes) != read_text(group, "sha256"):
-                raise StoreError(f"{path}:{name}: SHA-256 digest does not match the content; {ADVICE}")
+        if verify and digest(arrays, digested_attributes(group)) != read_text(group, "sha256"):
+            raise StoreError(f"{path}:{name}: SHA-256 digest does not match the content; {ADVICE}")
         if ("node_stress" in arrays) != ("cell_stress" in arrays):
             raise StoreError(f"{path}:{name}: has only one of the fields 'node_stress' and 'cell_stress'; {ADVICE}")
         for conflict in size_conflicts(arrays, metadata.dim, len(metadata.param_names)):
             raise StoreError(f"{path}:{name}: {conflict}; {ADVICE}")
         shapes, names, is_prediction, begins = shapes_of(group), node_types_of(group), PREDICTION in group.attrs, start_time_of(group)
+        openings = openings_of(group)
     for key, violation in metadata.violations():
         raise UnsoundError(f"{path}:{name}", f"{key} {violation}")
     if (wrong := shapes_fault(shapes, metadata.periodicity)) is not None:
+        raise UnsoundError(f"{path}:{name}", wrong)
+    if (wrong := openings_fault(openings, metadata.dim, len(metadata.param_names), len(names))) is not None:
         raise UnsoundError(f"{path}:{name}", wrong)
     for fault in faults(arrays, names, metadata.materials, metadata.param_names, first_frame):
         raise UnsoundError(f"{path}:{name}", str(fault))
@@ -384,7 +411,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         shapes,
         None if motion.num_frames == 1 else motion,
     )
-    return Trajectory(
+    found = Trajectory(
         metadata,
         arrays["pos"],
         arrays["vel"],
@@ -397,9 +424,12 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         cells=arrays.get("cells"),
         cell_dim=int(arrays["cell_dim"][0]) if "cell_dim" in arrays else None,
         stress=Stress(arrays["node_stress"], arrays["cell_stress"]) if "node_stress" in arrays else None,
+        alive=arrays["alive"].astype(bool) if "alive" in arrays else None,
+        openings=openings,
         start_time=begins + metadata.frame_dt * first_frame,
         is_prediction=is_prediction,
     )
+    return found.present()
 
 
 def shards(root: Path | str, split: str) -> list[Path]:

@@ -30,6 +30,8 @@ from gpe_pl.trajectory.arrays import (
 )
 from gpe_pl.trajectory.boundary import Array, Boundary, check_steps
 from gpe_pl.trajectory.cells import mean_over_corners
+from gpe_pl.trajectory.living import living
+from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State, Stress
 
 
@@ -197,6 +199,9 @@ class Trajectory:
         rest_pos, cells, cell_dim: reference configuration of meshes, as in ``State``.
         stress: stress of the mesh in every frame.
         rigid_body: number of the rigid body of each node, as in ``State``.
+        alive: mask [frame, node] of the nodes that are in an open scene; None if all are in it in every frame. A node enters and leaves at most once, so its
+            number is its identity. Before and after, its position and velocity are those of the nearest frame in which it is in the scene.
+        openings: inlets and outlets of an open scene.
         termination: reason why a rollout stopped early; None if it did not.
         start_time: time of the first frame since the start of the scene [s].
         is_prediction: whether the trajectory is a rollout of a simulator other than a ground-truth solver.
@@ -214,6 +219,8 @@ class Trajectory:
     stress: Stress | None = None
     cell_dim: int | None = None
     rigid_body: np.ndarray | None = None
+    alive: np.ndarray | None = None
+    openings: tuple[Opening, ...] = ()
     termination: Termination | None = field(default=None, compare=False)
     start_time: float = field(default=0.0, compare=False)
     is_prediction: bool = field(default=False, compare=False)
@@ -338,6 +345,8 @@ class Trajectory:
     def state(self, frame: int, history: int = 0) -> State:
         """Return the state at a frame.
 
+        In an open scene, it has the nodes that are in the scene at this frame. Before a node entered, its history has the velocity with which it entered.
+
         Without ``history``, the velocities are the stored ones. With ``history`` > 0, they are differences of the last ``history + 1`` stored positions in
         float64, as a learned simulator needs them, and the stored ones become ``State.frame_velocity``.
 
@@ -355,11 +364,12 @@ class Trajectory:
             vel = past[:, -1]
         rest_pos = None if self.rest_pos is None else self.rest_pos.astype(np.float64)
         stress = None if self.stress is None else Stress(self.stress.node[frame], self.stress.cell[frame])
-        return State(
+        state = State(
             pos, vel, self.node_type, self.mass, self.material_params, self.boundary.at(frame), gravity, past,
             self.start_time + frame * self.metadata.frame_dt, rest_pos, self.cells, stress, self.cell_dim, periodicity=self.metadata.periodicity,
             param_names=self.metadata.param_names, frame_velocity=at_frame, rigid_body=self.rigid_body,
         )  # fmt: skip
+        return state if self.alive is None else living(state, self.alive[: frame + 1], self.vel[: frame + 1], self.openings)
 
     def seen_from(self, origin: np.ndarray) -> Trajectory:
         """Return the trajectory in coordinates whose origin is at ``origin`` [dim] in m.
@@ -374,10 +384,13 @@ class Trajectory:
         bounds = tuple((low - x, high - x) for (low, high), x in zip(m.bounds, origin.tolist(), strict=True))
         motion = None if b.motion is None else replace(b.motion, pos=b.motion.pos - origin)
         boundary = replace(b, pos=b.pos - origin, shapes=tuple(moved(shape, -origin) for shape in b.shapes), motion=motion)
-        return replace(self, metadata=replace(m, bounds=bounds), pos=self.pos - origin, boundary=boundary, rest_pos=rest_pos)
+        openings = tuple(opening.moved(-origin) for opening in self.openings)
+        return replace(
+            self, metadata=replace(m, bounds=bounds), pos=self.pos - origin, boundary=boundary, rest_pos=rest_pos, openings=openings
+        )
 
     def frames(self, start: int, stop: int | None = None) -> Trajectory:
-        """Return the frames ``start:stop`` as a trajectory."""
+        """Return the frames ``start:stop`` as a trajectory. Nodes that are in none of them are left out."""
         stress = None if self.stress is None else Stress(self.stress.node[start:stop], self.stress.cell[start:stop])
         first, _, _ = slice(start, stop).indices(self.num_frames)
         return replace(
@@ -386,8 +399,9 @@ class Trajectory:
             vel=self.vel[start:stop],
             boundary=self.boundary.at(start, stop),
             stress=stress,
+            alive=None if self.alive is None else self.alive[start:stop],
             start_time=self.start_time + first * self.metadata.frame_dt,
-        )
+        ).present()
 
     def every(self, stride: int) -> Trajectory:
         """Return every ``stride``-th frame, from the first on, as a trajectory whose frames are ``stride`` times as long.
@@ -404,7 +418,26 @@ class Trajectory:
             vel=self.vel[::stride],
             boundary=self.boundary.every(stride),
             stress=None if self.stress is None else Stress(self.stress.node[::stride], self.stress.cell[::stride]),
+            alive=None if self.alive is None else self.alive[::stride],
             termination=None if stop is None else replace(stop, frame=-(-stop.frame // stride)),
+        ).present()
+
+    def present(self) -> Trajectory:
+        """Return the trajectory without nodes that are in the scene in no frame; the same object if there are none."""
+        if self.alive is None:
+            return self
+        some = np.asarray(self.alive.any(axis=0))
+        return self if some.all() else self.of_nodes(some)
+
+    def of_nodes(self, nodes: np.ndarray) -> Trajectory:
+        """Return some of the nodes, given by a mask [node], of a trajectory without mesh."""
+        per_node = {"node_type": self.node_type, "mass": self.mass, "material_params": self.material_params, "rigid_body": self.rigid_body}
+        return replace(
+            self,
+            pos=self.pos[:, nodes],
+            vel=self.vel[:, nodes],
+            alive=None if self.alive is None else self.alive[:, nodes],
+            **{name: values[nodes] for name, values in per_node.items() if values is not None},
         )
 
     def with_moving_boundary(self) -> Trajectory:
@@ -435,4 +468,5 @@ class Trajectory:
             rest_pos=None if self.rest_pos is None else np.concatenate([self.rest_pos, motion.pos[0, moves].astype(self.rest_pos.dtype)]),
             stress=stress,
             rigid_body=None if self.rigid_body is None else extended(self.rigid_body, -1),
+            alive=None if self.alive is None else np.pad(self.alive, ((0, 0), (0, count)), constant_values=True),
         )

@@ -202,6 +202,16 @@ def _bodies(_: _Scene, array: np.ndarray) -> Iterator[_Found]:
         yield _Found(array < -1, lambda k: f"is {array[k]}, must be -1 or the number of a body")
 
 
+def _one_stretch(_: _Scene, array: np.ndarray) -> Iterator[_Found]:
+    if array.size and array.max() > 1:
+        yield _Found(array > 1, lambda k: f"is {array[k]}, must be 0 or 1")
+    elif not array.all():
+        enters = np.diff(array.astype(np.int8), axis=0, prepend=0) == 1
+        again = enters & (np.cumsum(enters, axis=0) > 1)
+        if again.any():
+            yield _Found(again, lambda _: "enters the scene again; a node that comes back needs a new number")
+
+
 _RULES: dict[str, _Rule] = {
     "finite": _finite,
     "positive": _within(SMALLEST, LARGEST, "must be positive and finite"),
@@ -212,5 +222,6 @@ _RULES: dict[str, _Rule] = {
     "parameters": _parameters,
     "nodes of cells": _cells,
     "numbers of bodies": _bodies,
+    "one stretch": _one_stretch,
     "dimension of cells": _dimension_of_cells,
 }

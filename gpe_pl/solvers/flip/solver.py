@@ -16,6 +16,7 @@ from gpe_pl.schema import NODE_TYPES, node_code
 from gpe_pl.solvers.flip import islands, pressure, transfer, viscosity
 from gpe_pl.solvers.flip.grid import HALF, Grid, Solids, make_grid, make_solids
 from gpe_pl.solvers.flip.linear import conjugate_gradients, incomplete_cholesky
+from gpe_pl.solvers.flip.prescribed import Prescribed
 from gpe_pl.solvers.materials import parameters_of
 from gpe_pl.solvers.supported import check_surroundings
 from gpe_pl.trajectory.boundary import Boundary
@@ -201,6 +202,7 @@ class FLIP:
         """
         viscosity_of_node = self._check(state)
         solids = self.solids(state.boundary)
+        prescribed = Prescribed.of(state.openings, self.grid, solids) if state.openings else None
         # np.array copies: the kernels work in place, and the caller's arrays must not change
         pos, vel = np.array(state.pos, dtype=np.float64, order="C"), np.array(state.vel, dtype=np.float64, order="C")
         gravity, mass = np.array(state.gravity, dtype=np.float64), np.array(state.mass, dtype=np.float64)
@@ -209,7 +211,7 @@ class FLIP:
         remaining, substeps = self.frame_dt, 0
         while remaining > 0.0:
             h = self._substep(pos, vel, gravity, remaining, substeps)
-            self._advance(pos, vel, mass, viscosity_of_node, gravity, h, solids, fields)
+            self._advance(pos, vel, mass, viscosity_of_node, gravity, h, solids, fields, prescribed)
             remaining = remaining - h if h < remaining else 0.0
             substeps += 1
         _idle.clear()
@@ -263,10 +265,14 @@ class FLIP:
             active, grid.strides, solids.area, solids.face_distance, fields.density, fields.viscous, fields.velocity, h / grid.spacing**2
         )
 
-    def project(self, liquid: Liquid, solids: Solids, fields: Fields, h: float) -> np.ndarray:
+    def project(self, liquid: Liquid, solids: Solids, fields: Fields, h: float, prescribed: Prescribed | None = None) -> np.ndarray:
         """Make the grid's velocities divergence-free; return the pressure [liquid] in Pa that acts over a time h [s]."""
+        if prescribed is not None:
+            prescribed.impose(fields.touched, fields.velocity, fields.weight)
         pressure.fill_open_faces(liquid.cells, self.grid.strides, solids.area, fields.weight, fields.velocity, TOUCH)
         right = pressure.inflow(liquid.cells, self.grid.strides, solids.area, fields.velocity)
+        if prescribed is not None:
+            prescribed.add_inflow(fields.liquid, right)
         tolerance = self.pressure_tolerance * self.grid_spacing / h
         return self.density * self.grid_spacing / h * self._correct("pressure", liquid, right, tolerance, solids, fields, fields.velocity)
 
@@ -328,17 +334,19 @@ class FLIP:
 
     def _advance(
         self, pos: np.ndarray, vel: np.ndarray, mass: np.ndarray, viscosity_of_node: np.ndarray, gravity: np.ndarray, h: float,
-        solids: Solids, fields: Fields,
+        solids: Solids, fields: Fields, prescribed: Prescribed | None,
     ) -> None:  # fmt: skip
         """Advance pos and vel in place by one substep; ``fields`` are empty before and after."""
         grid = self.grid
+        if prescribed is not None:
+            start, solids = pos.copy(), prescribed.closed(solids)
         active = self.rasterize(pos, vel, mass, viscosity_of_node, solids, fields)
         transfer.add_impulse(active, h * gravity, fields.weight, fields.velocity)
         liquid, is_free = self.liquid(active, solids, fields)
         # viscosity must not see the part of gravity that pressure balances, because it would drag a liquid at rest along the walls
-        self.project(liquid, solids, fields, h)
+        self.project(liquid, solids, fields, h, prescribed)
         self.diffuse(active, solids, fields, h)
-        self.project(liquid, solids, fields, h)
+        self.project(liquid, solids, fields, h, prescribed)
         self.even_out(liquid, solids, fields, h)
         transfer.extend_into_solids(
             active, grid.origin, grid.spacing, grid.strides, grid.counts, grid.corners, solids.distance, solids.face_distance, fields.weight,
@@ -351,6 +359,8 @@ class FLIP:
         )  # fmt: skip
         flying.balance(pos, vel, gravity, h)
         transfer.push_out(pos, vel, grid.origin, grid.spacing, grid.strides, grid.counts, grid.corners, solids.distance)
+        if prescribed is not None:
+            prescribed.carry(start, pos, vel, h)
         transfer.clear(
             active, grid.strides, fields.velocity, fields.old, fields.shift, fields.weight, fields.density, fields.viscous, fields.touched,
             fields.liquid, fields.viscous_face,
@@ -427,7 +437,7 @@ class FLIP:
         for name, (array, expected) in shapes.items():
             if np.shape(array) != expected:
                 raise SimulationError(f"{name} has shape {np.shape(array)}, expected {expected}", reason="input")
-        check_surroundings(state, "FLIP")
+        check_surroundings(state, "FLIP", computes_open_scenes=True)
         if state.internal is not None:
             raise SimulationError(f"internal state is of type {type(state.internal).__name__}, expected None", reason="input")
         _require(np.isfinite(state.mass), "mass is not finite", reason="nan")

@@ -35,7 +35,7 @@ def warm() -> Any:
     assert s.cells is not None
     stress = Stress(np.ones((s.num_nodes, 4)), np.ones((len(s.cells), 4)))
     known = {f.name: getattr(s, f.name) for f in fields(s)} | {"stress": stress, "num_substeps": 7, "internal": "opaque", "time": 2.0}
-    known["frame_velocity"] = 0.5 * s.vel
+    known |= {"frame_velocity": 0.5 * s.vel, "node_id": np.arange(s.num_nodes)}
     return Warm(**known, temperature=np.arange(s.num_nodes) + 300.0, facets=s.cells[:, :2], wind=3.0, num_iterations=5)
 
 
@@ -140,7 +140,7 @@ def test_tensors_of_every_array() -> None:
     held = {f.name: getattr(state, f.name) for f in fields(state)} | vars(state.stress)
     assert not [name for name, value in held.items() if isinstance(value, np.ndarray)]
     for name in (*names_of(Warm, NODE), "gravity", "cell"):
-        assert held[name].dtype == (torch.int64 if name == "node_type" else torch.float64), name
+        assert held[name].dtype == (torch.int64 if name in ("node_type", "node_id") else torch.float64), name
     assert all(getattr(state.boundary, name).dtype == torch.float64 for name in names_of(Boundary, NODE))
 
 

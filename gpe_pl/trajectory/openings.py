@@ -1,0 +1,199 @@
+"""``Opening``: a box through which nodes enter or leave an open scene. Inlets and outlets are openings.
+
+An opening lies at one side of the scene and has its depth along the axis of that side. It either prescribes a speed or removes nodes:
+
+- Nodes in an opening with a ``speed`` move with it along the axis, whatever acts on them. With a positive speed, new nodes enter at the outer face. With a
+  negative speed, nodes leave when they pass the outer face.
+- An opening without a speed removes every node that is in it after a frame.
+
+New nodes lie on a lattice that moves with the speed, so their places follow from the time alone. Layer k of the lattice is at the distance
+``(k + 1/2) spacing + speed time`` from the outer face. Layers with k ≥ 0 are in the opening at the start of the scene (``nodes_at_start``).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from gpe_pl.files.json_text import parsed
+from gpe_pl.schema import LARGEST
+
+ROUNDING = 1e-6
+"""Fraction of a spacing by which sums of frame intervals may be wrong, so that a layer enters in the frame that exact times give."""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """An inlet or outlet. Lengths in m, times in s.
+
+    Attributes:
+        low, high: corners of the box [dim].
+        side: side of the box that is the outer face, such as ``x_low``.
+        speed: speed of its nodes into the scene [m/s], negative out of it; None for an opening that removes nodes.
+        spacing: distance of new nodes; 0 if none enter, as for the attributes below.
+        node_type: code of the material of new nodes.
+        mass: mass of a new node [kg].
+        params: material parameters of a new node, in the columns of the scene; None where its material lacks the parameter.
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    side: str
+    speed: float | None = None
+    spacing: float = 0.0
+    node_type: int = 0
+    mass: float = 0.0
+    params: tuple[float | None, ...] = ()
+
+    @property
+    def axis(self) -> int:
+        """Axis of the outer face."""
+        return "xyz".index(self.side[0])
+
+    @property
+    def inward(self) -> float:
+        """Sign of the direction into the scene along ``axis``."""
+        return 1.0 if self.side.endswith("low") else -1.0
+
+    @property
+    def depth(self) -> float:
+        return self.high[self.axis] - self.low[self.axis]
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocity of its nodes [dim] in m/s; zero without a speed."""
+        velocity = np.zeros(len(self.low))
+        velocity[self.axis] = self.inward * (self.speed or 0.0)
+        return velocity
+
+    def moved(self, by: np.ndarray) -> Opening:
+        """Return the opening displaced by ``by`` [dim] in m."""
+        low, high = (tuple((np.array(corner) + by).tolist()) for corner in (self.low, self.high))
+        return replace(self, low=low, high=high)
+
+    def depth_of(self, pos: np.ndarray) -> np.ndarray:
+        """Return the distances [node] in m of points [node, dim] from the outer face into the scene; infinite for points beside the opening."""
+        face = self.low[self.axis] if self.inward > 0 else self.high[self.axis]
+        others = [axis for axis in range(len(self.low)) if axis != self.axis]
+        beside = np.any([(pos[:, a] < self.low[a]) | (pos[:, a] > self.high[a]) for a in others], axis=0)
+        return np.where(beside, np.inf, self.inward * (pos[:, self.axis] - face))
+
+    def contains(self, pos: np.ndarray) -> np.ndarray:
+        """Return a mask [node] of the points [node, dim] in the box."""
+        depth = self.depth_of(pos)
+        return np.asarray((depth >= 0) & (depth <= self.depth))
+
+    def removes(self, pos: np.ndarray) -> np.ndarray:
+        """Return a mask [node] of the nodes at ``pos`` [node, dim] that leave: those in the box, if there is no speed, and up to a depth beyond its face."""
+        depth = self.depth_of(pos)
+        return np.asarray((depth >= -self.depth) & (depth < (self.depth if self.speed is None else 0.0)))
+
+    @property
+    def num_in_layer(self) -> int:
+        """Number of nodes of a layer of the lattice; 0 if none enter."""
+        return len(self._layer()) if self.enters else 0
+
+    @property
+    def enters(self) -> bool:
+        """Whether new nodes enter."""
+        return self.speed is not None and self.speed > 0 and self.spacing > 0
+
+    def nodes_at_start(self) -> np.ndarray:
+        """Return the positions [node, dim] in m of the lattice in the box at time 0."""
+        if not self.enters:
+            return np.empty((0, len(self.low)))
+        return self._nodes(np.arange(math.floor(self.depth / self.spacing + ROUNDING)), 0.0)
+
+    def entering(self, start: float, end: float) -> np.ndarray:
+        """Return the positions [node, dim] in m at the time ``end`` of the nodes that enter after ``start``, both in s since the start of the scene."""
+        if not self.enters:
+            return np.empty((0, len(self.low)))
+        first, last = (-self._num_layers(time) for time in (end, start))
+        return self._nodes(np.arange(last - 1, first - 1, -1), end)
+
+    def _num_layers(self, time: float) -> int:
+        """Return how many layers have passed the outer face between the start of the scene and a time."""
+        return math.floor((self.speed or 0.0) * time / self.spacing + 0.5 + ROUNDING)
+
+    def _nodes(self, layers: np.ndarray, time: float) -> np.ndarray:
+        face = self.low[self.axis] if self.inward > 0 else self.high[self.axis]
+        depth = np.maximum(0.0, (layers + 0.5) * self.spacing + (self.speed or 0.0) * time)
+        layer = self._layer()
+        pos = np.tile(layer, (len(layers), 1))
+        pos[:, self.axis] = face + self.inward * np.repeat(depth, len(layer))
+        return pos
+
+    def _layer(self) -> np.ndarray:
+        """Return positions [node, dim] of a layer, in the middle of the cross-section; 0 along the axis."""
+        lines = []
+        for axis, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
+            count = 1 if axis == self.axis else max(1, math.floor((high - low) / self.spacing + ROUNDING))
+            margin = (high - low - (count - 1) * self.spacing) / 2
+            lines.append(np.zeros(1) if axis == self.axis else low + margin + self.spacing * np.arange(count))
+        return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(self.low))
+
+
+def openings_to_json(openings: Sequence[Opening]) -> str:
+    """Convert openings to text, from which ``openings_from_json`` rebuilds them."""
+    return json.dumps([asdict(opening) for opening in openings], sort_keys=True)
+
+
+def openings_from_json(text: str) -> tuple[Opening, ...]:
+    """Rebuild openings from text. Their values may break the rules of ``openings_fault``.
+
+    Raises:
+        ValueError: the text is no JSON, or a key is missing, unknown or of another type.
+    """
+    values, known = parsed(text), {f.name for f in fields(Opening)}
+    if not isinstance(values, list) or not all(isinstance(v, dict) and set(v) == known for v in values):
+        raise ValueError(f"must be a list of openings with the keys {', '.join(sorted(known))}")
+    return TypeAdapter(tuple[Opening, ...]).validate_json(text, strict=True)
+
+
+def openings_fault(openings: Sequence[Opening], dim: int, num_params: int, num_types: int) -> str | None:
+    """Describe the first opening that breaks a rule; None if all are valid. Every reader of files calls it.
+
+    Args:
+        openings: openings of a scene.
+        dim: dimension of space.
+        num_params: number of columns of material parameters of the scene.
+        num_types: number of node types.
+    """
+    for number, opening in enumerate(openings, 1):
+        if (fault := _fault(opening, dim, num_params, num_types)) is not None:
+            return f"opening {number}: {fault}"
+    return None
+
+
+def _fault(opening: Opening, dim: int, num_params: int, num_types: int) -> str | None:
+    def is_number(value: float) -> bool:
+        return abs(value) < LARGEST
+
+    for key in ("low", "high"):
+        corner = getattr(opening, key)
+        if len(corner) != dim or not all(map(is_number, corner)):
+            return f"{key} is {corner!r}, must be {dim} numbers"
+    if not all(low < high for low, high in zip(opening.low, opening.high, strict=True)):
+        return f"low {opening.low} must be below high {opening.high} along every axis"
+    sides = [f"{axis}_{end}" for axis in "xyz"[:dim] for end in ("low", "high")]
+    if opening.side not in sides:
+        return f"side is {opening.side!r}, must be one of {', '.join(sides)}"
+    if opening.speed is not None and not is_number(opening.speed):
+        return f"speed is {opening.speed!r}, must be a number of m/s or null"
+    if not is_number(opening.spacing) or opening.spacing < 0:
+        return f"spacing is {opening.spacing!r}, must be at least 0"
+    if not opening.enters:
+        return None
+    if not is_number(opening.mass) or opening.mass <= 0:
+        return f"mass is {opening.mass!r}, must be positive"
+    if not 0 <= opening.node_type < num_types:
+        return f"node_type is {opening.node_type!r}, must be the code of a material"
+    params = opening.params
+    if len(params) != num_params or not all(p is None or is_number(p) for p in params):
+        return f"params are {params!r}, must be one number or null for each of {num_params} columns"
+    return None
