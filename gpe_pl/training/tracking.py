@@ -1,7 +1,8 @@
-"""Loggers of a run: CSV files in its folder always, and Weights & Biases (W&B) if configured."""
+"""Loggers of a run: CSV files in its folder always, and Weights & Biases (W&B) or TensorBoard if configured."""
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import netrc
 import os
@@ -13,8 +14,10 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlparse
 
-from lightning.pytorch.loggers import CSVLogger, Logger
+import numpy as np
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
+from PIL import Image
 
 from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_text, replacing
@@ -23,6 +26,8 @@ log = logging.getLogger(__name__)
 
 WANDB_URL = "https://api.wandb.ai"
 FILMS: tuple[Literal["gif", "mp4"], ...] = ("gif", "mp4")
+TENSORBOARD = "tensorboard"
+"""Name of the folder of TensorBoard's event files in a run's folder. A resumed run continues there."""
 RUN_ID = "run_id"
 """Name of the file in a run's folder that holds the identifier of the run in W&B."""
 
@@ -32,17 +37,17 @@ class LoggerSettings:
     """Where to log metrics. CSV files in the run's folder are always written.
 
     Attributes:
-        kind: ``wandb`` also logs to W&B.
+        kind: ``wandb`` also logs to W&B, ``tensorboard`` to event files in the run's folder.
         project: project in W&B.
         mode: mode of W&B. None takes ``WANDB_MODE``, or else ``online`` if there is an API key and ``offline`` if not.
     """
 
-    kind: Literal["csv", "wandb"] = "csv"
+    kind: Literal["csv", "wandb", "tensorboard"] = "csv"
     project: str = "gpe_pl"
     mode: Literal["online", "offline", "disabled"] | None = None
 
     def loggers(self, run_dir: Path, name: str, config: Mapping[str, Any]) -> list[Logger]:
-        """Return loggers of a run: CSV under ``run_dir/log``, one version per start of the run, and W&B if configured.
+        """Return loggers of a run: CSV under ``run_dir/log``, one version per start of the run, and W&B or TensorBoard if configured.
 
         Args:
             run_dir: folder of the run; it keeps the identifier under which a resumed run continues in W&B.
@@ -50,12 +55,16 @@ class LoggerSettings:
             config: configuration of the run, shown in W&B.
 
         Raises:
-            TrackingError: W&B refuses the run.
+            TrackingError: W&B refuses the run, or TensorBoard is not installed.
         """
         loggers: list[Logger] = [Log(run_dir, name="log", flush_logs_every_n_steps=1)]
         if self.kind == "wandb":
             mode = self.mode or os.environ.get("WANDB_MODE") or ("online" if has_key() else "offline")
             loggers.append(self._wandb(run_dir, name, config, mode))
+        if self.kind == "tensorboard":
+            if importlib.util.find_spec("tensorboard") is None:
+                raise TrackingError("logger=tensorboard: needs tensorboard: `pip install 'gpe_pl[tensorboard]'`, or choose logger=csv")
+            loggers.append(TensorBoardLogger(run_dir, name="", version=TENSORBOARD))
         return loggers
 
     def _wandb(self, run_dir: Path, name: str, config: Mapping[str, Any], mode: str) -> Logger:
@@ -101,7 +110,7 @@ class Log(CSVLogger):
 
 
 class TrackingError(GpeError):
-    """Raised when W&B refuses a run; the message says why."""
+    """Raised when metrics cannot be logged as configured; the message says why."""
 
 
 def has_key() -> bool:
@@ -132,10 +141,16 @@ def run_id(run_dir: Path) -> str:
 
 
 def publish(loggers: Iterable[Logger], run_dir: Path, results: Mapping[str, float]) -> None:
-    """Send results, figures and animations of the evaluation to W&B and close the run, if W&B is among the loggers."""
+    """Send results and figures of the evaluation to W&B, with animations, or to TensorBoard, if they are among the loggers, and close the run there."""
     from lightning.pytorch.loggers import WandbLogger
 
     for logger in loggers:
+        if isinstance(logger, TensorBoardLogger):
+            for path in sorted(run_dir.glob("*.png")):
+                with Image.open(path) as picture:
+                    logger.experiment.add_image(path.stem, np.asarray(picture.convert("RGB")), dataformats="HWC")
+            logger.log_metrics(dict(results))
+            logger.finalize("success")
         if isinstance(logger, WandbLogger):
             import wandb
 

@@ -210,7 +210,7 @@ def test_a_misspelling_beside_a_sweep_gets_the_valid_ones() -> None:
         ("evaluation.splits=[]", r"evaluation.splits=\[\]: must have at least 1 values"),
         ("seed=-1", "seed=-1: must be an integer of at least 0"),
         ("seed=first", "seed='first': must be an integer of at least 0"),
-        ("logger.kind=tb", "logger.kind='tb': must be 'csv' or 'wandb'"),
+        ("logger.kind=tb", "logger.kind='tb': must be 'csv', 'wandb' or 'tensorboard'"),
         ("trainer.num_workers=-1", "trainer.num_workers=-1: must be "),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import errno
+import importlib.util
 import logging
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,6 +13,7 @@ import pytest
 import wandb
 from lightning.pytorch import loggers as lightning_loggers
 from lightning.pytorch.loggers import Logger
+from PIL import Image
 
 from gpe_pl.files.atomic import FullDiskError
 from gpe_pl.training import tracking
@@ -107,6 +109,26 @@ def test_every_start_of_a_run_is_to_be_uploaded(tmp_path: Path, monkeypatch: pyt
     with caplog.at_level(logging.WARNING):
         publish([logger], tmp_path, {"test/rollout_mse@full": 1.0})
     assert f"wandb sync {folders[0]} {folders[1]}`" in caplog.text
+
+
+def test_tensorboard_has_losses_of_every_start_and_results_with_figures(tmp_path: Path) -> None:
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator", reason="tensorboard is not installed")
+    for step in (0, 1):  # the second as if the run had been resumed
+        *_, logger = LoggerSettings("tensorboard").loggers(tmp_path, "run", {})
+        logger.log_metrics({"train/loss": 0.5}, step=step)
+        logger.finalize("success")
+    Image.new("RGB", (8, 8)).save(tmp_path / "rollout_test_00.png")
+    publish([logger], tmp_path, {"test/rollout_mse@full": 0.25})
+    found = events.EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"images": 0}).Reload()
+    assert [event.step for event in found.Scalars("train/loss")] == [0, 1]
+    assert found.Scalars("test/rollout_mse@full")[0].value == 0.25
+    assert found.Tags()["images"] == ["rollout_test_00"]
+
+
+def test_a_missing_tensorboard_is_said_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(TrackingError, match=r"pip install 'gpe_pl\[tensorboard\]'"):
+        LoggerSettings("tensorboard").loggers(tmp_path, "run", {})
 
 
 @pytest.mark.parametrize("room", [0, 10, 60])
