@@ -42,7 +42,7 @@ from gpe_pl.learned.pretrained import model_name
 from gpe_pl.system import early_interrupts
 from gpe_pl.system.signatures import checked, parameters
 
-WITHOUT_KEY = {"comparison", "experiment", "law", "parameters", "recipe", "scene", "solver", "tuned"}
+WITHOUT_KEY = {"adaptation", "comparison", "experiment", "law", "parameters", "recipe", "scene", "solver", "tuned"}
 """Config groups that set keys under other names than their own. A command may have a key of its own by such a name, as convert has ``parameters``."""
 
 plugins.register()  # files in conf/ use the plugins

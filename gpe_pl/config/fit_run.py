@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
@@ -30,9 +31,11 @@ from gpe_pl.evaluation.metric_rows import LEARNED, means, read_rows
 from gpe_pl.evaluation.rollouts import evaluate
 from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, claim, without_tables
+from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.pretrained import fingerprint
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.transfer import check_model
 from gpe_pl.models.lookup import model_class
 from gpe_pl.reports.finished_runs import Run, rollout_errors, table_of
 from gpe_pl.rollout.loop import Restartable
@@ -40,9 +43,12 @@ from gpe_pl.system.progress import no_bar, progress_bar
 from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_time_key, within_budget
 from gpe_pl.training.loss_terms import mean_num_neighbors
 from gpe_pl.training.module import TrainingModule
+from gpe_pl.training.optimizer import train_only
 from gpe_pl.training.parallel import end_later_processes
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, seed, set_up, train
 from gpe_pl.training.tracking import LoggerSettings, publish
+
+log = logging.getLogger(__name__)
 
 OPTIMISATION = (
     *("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps"),
@@ -69,6 +75,10 @@ class FitRun:
             raise ConfigError(f"start_from={cfg.start_from!r}: must be null, the folder of a run, a checkpoint or a shipped model")
         self.cfg, self.folder, self.runs = cfg, folder, Path(cfg.paths.runs)
         self.training = construct(TrainingSettings, cfg.training, "training")
+        if cfg.start_from is None and self.training.num_steps == 0:
+            raise ConfigError("training.num_steps=0: there is nothing to evaluate; needs start_from, or at least 1 step")
+        if cfg.start_from is None and self.training.early_layers is not None:
+            raise ConfigError(f"training.early_layers={self.training.early_layers}: the other layers stay as they are; needs start_from")
         self.trainer = construct(TrainerSettings, cfg.trainer, "trainer")
         self.evaluation = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
         check_splits(evaluated_config(cfg), self.evaluation.splits, "evaluation.splits")
@@ -92,19 +102,22 @@ class FitRun:
         self.callbacks: list[PauseForMeasurements] = []
 
     def prepare_data(self) -> None:
-        """Generate missing data and controls, after checking that noise, evaluation and the model of ``start_from`` fit the scenes. Choose the device.
+        """Generate missing data and controls, after checking that noise and evaluation fit the scenes, and ``start_from`` the model. Choose the device.
 
         Raises:
             NoiseError: the noise is too large for the spacing of the scenes.
-            SceneError: the model of ``start_from`` does not fit the scenes.
+            CheckpointError: the model of ``start_from`` has other settings.
             StartError: ``evaluation.start_time`` leaves too little history, or is between frames.
             ConfigError: evaluated data have frames of another length.
         """
         scenes, evaluated = scene_metadata(self.cfg, "train"), evaluated_config(self.cfg)
         self.training.noise.check(scenes)
         if self.start is not None:
+            builder = GraphBuilder(self.graph, scenes)
+            check_model(LearnedSimulator(self.new_model(spec=builder.spec), builder, self.stride), self.start)
             stride = self.start.stride_on(scene_metadata(self.cfg, "train", strided=False))
-            self.start.check_scene(scenes, f"data.stride={stride}" if stride else "")
+            if stride and stride != self.stride:
+                log.warning("start_from: data.stride=%d has frames as long as those of the trained model", stride)
         self.first_frame = self.evaluation.first_frame(self.graph.history, scenes.frame_dt)
         if self.cfg.evaluation.data:
             check_same_frames(scenes, scene_metadata(evaluated, self.evaluation.splits[0]))
@@ -146,6 +159,11 @@ class FitRun:
 
     def train(self) -> Path:
         """Train to the last step, starting from the last checkpoint if there is one, and return the best checkpoint."""
+        if self.training.num_steps == 0:
+            best = self.folder / "checkpoints" / "best.ckpt"
+            best.parent.mkdir(parents=True, exist_ok=True)
+            self._new_module(self.training).simulator.save(best)
+            return best
         best = train(self._new_module(self.training), self._data, self.training, self.trainer, self._loggers, self.folder, self.callbacks)
         end_later_processes()
         return best
@@ -244,7 +262,9 @@ class FitRun:
         simulator.fit_statistics(sample, data.parameter_ranges(), data.trained_scene())
         neighbors = mean_num_neighbors(sample, data.builder.spec.materials) if training.neighbor_weight is not None else 1.0
         if self.start is not None:
-            simulator.start_from(self.start)
+            new = simulator.start_from(self.start).new
+            if training.early_layers is not None:
+                train_only(simulator.model, [*simulator.model.early_layers(training.early_layers)], new.values())
         return TrainingModule(simulator, mean_neighbors=neighbors, **{name: getattr(training, name) for name in OPTIMISATION})
 
     def _step_time(self, training: TrainingSettings) -> float:

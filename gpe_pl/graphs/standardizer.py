@@ -139,14 +139,6 @@ class GraphStandardizer(nn.Module):
             return []
         return [*materials, *(r for r in self.spec.relations if cast(Standardize, self.odd[self._key(r)]).is_identity)]
 
-    def take_over(self, other: GraphStandardizer) -> None:
-        """Copy the statistics of another standardizer. Statistics that the other lacks are kept."""
-        own = {name: module for name, module in self.named_modules() if isinstance(module, Standardize)}
-        for name, module in other.named_modules():
-            if isinstance(module, Standardize) and not module.is_identity:
-                own[name].load_state_dict(module.state_dict())
-        self.mass.copy_(other.mass)
-
     def standards(self, limits: dict[str, Tensor] | None = None) -> Standards:
         """Return the statistics as arrays for compiled features on the CPU. They are kept until a statistic changes.
 

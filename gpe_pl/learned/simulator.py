@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import io
-import json
 import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -31,7 +30,7 @@ from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
 from gpe_pl.graphs.standards import Standards
 from gpe_pl.graphs.topology import Topology
-from gpe_pl.learned import next_states
+from gpe_pl.learned import next_states, transfer
 from gpe_pl.learned.checkpoint_file import CheckpointError as CheckpointError
 from gpe_pl.learned.checkpoint_file import load_checkpoint, reason
 from gpe_pl.learned.mirror_average import MirrorAverage
@@ -39,6 +38,7 @@ from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.pretrained import checkpoint_path
 from gpe_pl.learned.rollout_settings import RolloutSettings
 from gpe_pl.learned.training_ranges import named_materials, outside_masses, outside_parameters, stored_ranges
+from gpe_pl.learned.transfer import Transfer
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
 from gpe_pl.nn.static_friction import keeps_position, supported
@@ -47,7 +47,7 @@ from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, EdgeType, node_code
 from gpe_pl.system.signatures import check_plain, checked
 from gpe_pl.trajectory.rigid_bodies import all_of_bodies
-from gpe_pl.trajectory.scene_ranges import described, outside, scene_range, united, unlimited
+from gpe_pl.trajectory.scene_ranges import described, outside, scene_range, unlimited
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
@@ -201,47 +201,13 @@ class LearnedSimulator(nn.Module):
         stress_unit = float(self.stress_std / self.standardizer.mass) * square
         model.set_units(float(self.acceleration_std) * square, scales.spacing, stress_unit)
 
-    @torch.no_grad()
-    def start_from(self, trained: LearnedSimulator) -> None:
-        """Copy the weights and statistics of another simulator. Statistics that the other lacks are kept. Trained ranges then cover both trainings.
+    def start_from(self, trained: LearnedSimulator) -> Transfer:
+        """Copy what fits of the weights and statistics of another simulator (see ``transfer.start_from``). Return what was copied and what is new."""
+        return transfer.start_from(self, trained)
 
-        Raises:
-            SceneError: the other simulator was trained with another frame interval, spacing, dimension or materials.
-            CheckpointError: the other simulator has another model or other graphs; the message names the settings to choose.
-        """
-        trained.check_scene(self.builder.metadata)
-        there, now = trained._choices(), self._choices()
-        different = [f"{key}={value}" for key, value in there.items() if now.get(key) != value]
-        if different:
-            raise CheckpointError(f"the model to start from is another one or has other graphs; choose {' '.join(different)}")
-        ranges = {material: values.clone() for material, values in self.trained_ranges()}
-        statistics = copy.deepcopy(self.standardizer)
-        scene, mass = self.trained_scene.cpu().numpy().copy(), self.trained_mass.clone()
-        try:
-            self.load_state_dict(trained.state_dict())
-        except RuntimeError as error:  # weights per level of a mesh, and another number of levels
-            raise CheckpointError(f"the model to start from has meshes of other sizes ({reason(error)})") from None
-        statistics.take_over(self.standardizer)
-        self.standardizer, self._unknown = statistics, None
-        for material, values in self.trained_ranges():
-            known = [r for r in (values.clone(), ranges[material]) if bool(r.isfinite().all())]  # skips ranges never set
-            if known:
-                values[0].copy_(torch.stack(known).amin(dim=0)[0])
-                values[1].copy_(torch.stack(known).amax(dim=0)[1])
-        self.trained_scene.copy_(torch.from_numpy(united([scene, self.trained_scene.cpu().numpy()])))
-        self.trained_mass[0] = torch.minimum(mass[0], self.trained_mass[0])
-        self.trained_mass[1] = torch.maximum(mass[1], self.trained_mass[1])
-
-    def _choices(self) -> dict[str, str]:
-        """Return the overrides that choose this model and these graphs. The radius is given in spacings, also if it is the default of the data set."""
-        own = self.description()
-        spacings = {"connectivity_spacings": float(f"{self.builder.scales.radius / self.builder.scales.spacing:.6g}")}
-        parts = {"model": {"_target_": own["model"], **own["settings"]}, "graph": own["graph"] | spacings}
-        return {
-            f"{part}.{key}": value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
-            for part, values in parts.items()
-            for key, value in values.items()
-        }
+    def forget_known_statistics(self) -> None:
+        """Determine again which node types and relations have no statistics, when a scene contains them."""
+        self._unknown = None
 
     def trained_ranges(self) -> Iterator[tuple[str, Tensor]]:
         """Yield each material with the lowest and highest value [2, param] of its parameters in training."""

@@ -9,8 +9,13 @@ import torch
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
+from gpe_pl.errors import GpeError
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import FeatureSpec
+
+
+class LayersError(GpeError, ValueError):
+    """Raised when the early layers of a model should be trained alone, and it has none."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,18 @@ class Model(nn.Module, ABC):
     def is_fused(self) -> bool:
         """Whether the model has fused passes for CPUs. If so, ``torch.compile`` makes it no faster on a CPU."""
         return False
+
+    def early_layers(self, num_steps: int) -> list[nn.Module]:
+        """Return the encoders, the embeddings of materials and the layers of the first message-passing steps, for fine-tuning of these alone.
+
+        Raises:
+            LayersError: the model has no layers of single steps.
+        """
+        raise LayersError(f"{type(self).__name__} has no layers of single message-passing steps; choose training.early_layers=null")
+
+    def parameter_weights(self) -> dict[str, str]:
+        """Return the name of the weights [hidden, param] that read the parameters of each material. Others, whose weights read further features, are absent."""
+        return {}
 
     def set_units(self, acceleration: float, spacing: float, stress: float) -> None:
         """Tell the model the units of a data set, before training.

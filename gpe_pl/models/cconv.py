@@ -84,6 +84,10 @@ class ContinuousConvNet(Model):
         self.convs = nn.ModuleList([ContinuousConv(a, b, spec.dim, kernel_size) for a, b in pairs])
         self.denses = nn.ModuleList([_dense(a, b) for a, b in pairs])
 
+    def early_layers(self, num_steps: int) -> list[nn.Module]:
+        first = [self.conv_boundary, self.conv_particles, self.dense_particles]
+        return [*first, *self.convs[:num_steps], *self.denses[:num_steps]]
+
     @property
     def num_hops(self) -> int:
         return 1 + len(self.convs)

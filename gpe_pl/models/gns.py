@@ -86,6 +86,9 @@ class GNS(Model):
         self.processor = nn.ModuleList([InteractionNetwork(hidden, layers) for _ in range(num_message_passing_steps)])
         self.decoder = ReluMLP(hidden, hidden, spec.dim, layers)
 
+    def early_layers(self, num_steps: int) -> list[nn.Module]:
+        return [self.type_embedding, self.node_encoder, self.edge_encoder, *self.processor[:num_steps]]
+
     @property
     def num_hops(self) -> int:
         return len(self.processor)

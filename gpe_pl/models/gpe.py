@@ -24,7 +24,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.gpe_program_runner import Decoded, GPEProgramRunner, notice
 from gpe_pl.nn.blocks import MLP, NORM_EPS
-from gpe_pl.nn.connected import Edges, order_of_edges, renumbered, reordered, touched
+from gpe_pl.nn.connected import Edges, merged_levels, order_of_edges, renumbered, reordered, touched
 from gpe_pl.nn.elastic_bodies import CellError, ElasticBodies
 from gpe_pl.nn.fused import works_on
 from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_processor
@@ -130,25 +130,6 @@ class PairForce(nn.Module):
             return self.lin_out(forward)
         reverse = self.act(a[j] + b[i] + s - w)  # both ends have one type, so they index the same rows
         return self.lin_out(forward - reverse)
-
-
-def _merge_levels(x: dict[str, Tensor], edges: Edges) -> tuple[dict[str, Tensor], Edges]:
-    """Merge all levels of virtual nodes into one node type. The messages are the same, because all levels have the same weights, but fewer calls are needed."""
-    first: dict[str, int] = {}
-    nodes: dict[str, list[Tensor]] = {}
-    for node_type, value in x.items():
-        parts = nodes.setdefault(role(node_type), [])
-        first[node_type] = sum(part.shape[0] for part in parts)
-        parts.append(value)
-    merged: dict[EdgeType, list[tuple[Tensor, Tensor, Tensor]]] = {}
-    for (source, name, target), (index, odd, even) in edges.items():
-        index = torch.stack([index[0] + first[source], index[1] + first[target]])
-        merged.setdefault((role(source), name, role(target)), []).append((index, odd, even))
-    joined: Edges = {}
-    for relation, stores in merged.items():
-        indices, odds, evens = zip(*stores, strict=True)
-        joined[relation] = torch.cat(indices, dim=1), torch.cat(odds), torch.cat(evens)
-    return {t: torch.cat(parts) for t, parts in nodes.items()}, joined
 
 
 def _conv(conv: Any) -> Conv:
@@ -324,6 +305,15 @@ class GPE(Model):
         if self.settings["elastic"]:
             self.elastic_bodies.set_units(acceleration, spacing, stress)
 
+    def early_layers(self, num_steps: int) -> list[nn.Module]:
+        constants = [self.elastic_bodies] if self.settings["elastic"] else []
+        encoders = [self.material_embedding, self.node_encoder, self.edge_encoder]
+        return [*encoders, *constants, *self.convs[:num_steps], *self.updates[:num_steps]]
+
+    def parameter_weights(self) -> dict[str, str]:
+        first = "weight" if self.settings["material_embedding"] == "affine" else "0.weight"
+        return {m: f"material_embedding.{m}.theta.{first}" for m in self.material_embedding}
+
     @property
     def num_hops(self) -> int:
         return self.num_message_passing_steps + (self.decoder == "pair" or bool(self.bodies))  # a pair force reads the other end
@@ -399,7 +389,7 @@ class GPE(Model):
         relations = [r for r in self.spec.relations if self.key(r) in convs and (keep_absent or data[r].edge_index.shape[1])]
         edges = {r: (data[r].edge_index, data[r].odd, data[r].even) for r in relations}
         if grid(1) in x and self.level_weights == "shared":
-            x, edges = _merge_levels(x, edges)
+            x, edges = merged_levels(x, edges)
         apart = self.skips.isolated_nodes and not self.training
         body = {m: data[m].body for m in self.bodies if m in x}
         return (self._compute_apart if apart else self._compute_in_order)(x, params, mass, body, edges)

@@ -1,4 +1,4 @@
-"""Selects the nodes that have edges, and sorts nodes in memory.
+"""Selects the nodes that have edges, sorts nodes in memory, and merges levels of virtual nodes.
 
 Nodes without an edge need no message passing. Message passing is faster if the nodes at both ends of an edge are near each other in memory.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gpe_pl.schema import EdgeType
+from gpe_pl.schema import EdgeType, role
 
 Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
 """``edge_index``, ``odd`` and ``even`` of each relation that has edges."""
@@ -63,3 +63,22 @@ def _with_numbers(edges: Edges, number: dict[str, Tensor]) -> Edges:
         (source, name, target): (torch.stack([number[source][index[0]], number[target][index[1]]]), odd, even)
         for (source, name, target), (index, odd, even) in edges.items()
     }
+
+
+def merged_levels(x: dict[str, Tensor], edges: Edges) -> tuple[dict[str, Tensor], Edges]:
+    """Merge all levels of virtual nodes into one node type. The messages are the same, because all levels have the same weights, but fewer calls are needed."""
+    first: dict[str, int] = {}
+    nodes: dict[str, list[Tensor]] = {}
+    for node_type, value in x.items():
+        parts = nodes.setdefault(role(node_type), [])
+        first[node_type] = sum(part.shape[0] for part in parts)
+        parts.append(value)
+    merged: dict[EdgeType, list[tuple[Tensor, Tensor, Tensor]]] = {}
+    for (source, name, target), (index, odd, even) in edges.items():
+        index = torch.stack([index[0] + first[source], index[1] + first[target]])
+        merged.setdefault((role(source), name, role(target)), []).append((index, odd, even))
+    joined: Edges = {}
+    for relation, stores in merged.items():
+        indices, odds, evens = zip(*stores, strict=True)
+        joined[relation] = torch.cat(indices, dim=1), torch.cat(odds), torch.cat(evens)
+    return {t: torch.cat(parts) for t, parts in nodes.items()}, joined

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -10,6 +11,17 @@ import torch
 from torch import Tensor, nn
 
 from gpe_pl.training import parameter_passes
+
+log = logging.getLogger(__name__)
+
+
+def train_only(model: nn.Module, layers: Iterable[nn.Module], parameters: Iterable[nn.Parameter]) -> None:
+    """Keep all parameters of a model as they are in training, except those of some layers and some single ones."""
+    trained = {id(p) for p in (*(p for layer in layers for p in layer.parameters()), *parameters)}
+    for parameter in model.parameters():
+        parameter.requires_grad_(id(parameter) in trained)
+    count = sum(p.numel() for p in model.parameters() if p.requires_grad)
+    log.info("training.early_layers: %s of %s weights are trained", f"{count:,}", f"{sum(p.numel() for p in model.parameters()):,}")
 
 
 class OnePassAdam(torch.optim.Adam):

@@ -51,6 +51,7 @@ class TrainingSettings:
     """Settings of the optimisation. ``TrainingModule``, ``TrajectoryDataModule``, ``data.noise`` and ``data.sampling`` describe those not listed here.
 
     Attributes:
+        num_steps: number of optimiser steps; 0 keeps the model of ``start_from`` as it is.
         budget_minutes: training time on one core or GPU [min]; replaces ``num_steps`` (see ``training.budget``).
         gradient_clip: largest norm of the gradient; None switches clipping off.
         ema_decay: decay of the moving average of the weights; None switches averaging off.
@@ -60,10 +61,12 @@ class TrainingSettings:
         push_correction: fraction of the velocity's deviation after an unroll that the target removes within one step, with ``targets=trajectory``.
         mirror: mirror training windows at random along axes without gravity; see ``WindowDataset``.
         targets: targets of noisy and unrolled states, see ``Targets`` and ``data.solver_targets``.
+        early_layers: train only the weights that ``start_from`` did not give, the embeddings of materials, the encoders, and this number of the first
+            message-passing steps; None trains all weights.
         val_containment: put particles that cross a wall back on its surface in the validation rollouts, which choose the best checkpoint.
     """
 
-    num_steps: Annotated[int, Field(ge=1)]
+    num_steps: Annotated[int, Field(ge=0)]
     budget_minutes: Annotated[float, Field(gt=0)] | None = None
     batch_size: Annotated[int, Field(ge=1)] = 2
     learning_rate: Annotated[float, Field(gt=0)] = 1e-3
@@ -85,6 +88,7 @@ class TrainingSettings:
     stress_weight: Annotated[float, Field(gt=0)] = 1.0
     unroll_steps: Annotated[int, Field(ge=1, le=100)] | None = None
     neighbor_weight: Annotated[float, Field(gt=0, le=10)] | None = None
+    early_layers: Annotated[int, Field(ge=0)] | None = None
     compile: Compile = "auto"
     val_interval: Annotated[int, Field(ge=1)] = 1000
     num_val_rollouts: Annotated[int, Field(ge=1)] = 4

@@ -514,13 +514,28 @@ def test_training_starts_from_another_runs_model(tiny_data: Path, tmp_path: Path
     fit(tiny(tiny_data, tmp_path, "name=again", f"start_from={tmp_path / 'moved'}", "seed=1", *still))  # the same model, wherever it lies
 
 
+@pytest.mark.slow
+def test_a_model_of_sand_starts_and_adapts_to_snow(tiny_data: Path, tmp_path: Path) -> None:
+    fit(tiny(tiny_data, tmp_path, "name=sand"))
+    sand = LearnedSimulator.from_checkpoint(tmp_path / "sand").model.state_dict()
+    snow = ("data=snow", f"start_from={tmp_path / 'sand'}")
+    for name, overrides in (("zero", ("training.num_steps=0",)), ("early", ("training.early_layers=0", "training.learning_rate=0.1"))):
+        fit(tiny(tiny_data, tmp_path, f"name={name}", *snow, *overrides))
+        model = LearnedSimulator.from_checkpoint(tmp_path / name).model
+        same = {key for key, value in model.state_dict().items() if torch.equal(value, sand[key.replace("snow", "sand")])}
+        changed = {key.split(".")[0] for key in model.state_dict() if key not in same}
+        assert changed == ({"material_embedding"} if name == "zero" else {"material_embedding", "node_encoder", "edge_encoder"})
+        assert {r.split for r in read_rows(tmp_path / name / "metrics.csv")} == {"test", "test_unseen"}
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
         ("start_from=nowhere", "nowhere: no such checkpoint; give the folder of a run"),
         ("start_from=3", "start_from=3: must be null, the folder of a run"),
-        ("start_from=snow", "the model was trained with .* on snow"),
-        ("start_from=sand", "trained with .* spacing=0.015625 m .*; the scene has .* spacing=0.0208333 m"),
+        ("start_from=snow", "another one; choose .*model.num_message_passing_steps=4 model.hidden_channels=64"),
+        ("training.early_layers=1", "training.early_layers=1: the other layers stay as they are; needs start_from"),
+        ("training.num_steps=0", "training.num_steps=0: there is nothing to evaluate; needs start_from"),
     ],
 )
 def test_a_start_that_does_not_fit_is_refused(tiny_data: Path, tmp_path: Path, override: str, message: str) -> None:

@@ -194,7 +194,7 @@ def test_a_misspelling_beside_a_sweep_gets_the_valid_ones() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("training.num_steps=0", "training.num_steps=0: must be at least 1"),
+        ("training.num_steps=-1", "training.num_steps=-1: must be at least 0"),
         ("training.num_steps=", "training.num_steps='': must be an integer"),
         ("training.sampling=unform", "training.sampling='unform': must be 'uniform' or 'activity'"),
         ("training.learning_rate=inf", "training.learning_rate=inf: must be a finite number"),

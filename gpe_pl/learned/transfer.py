@@ -1,0 +1,206 @@
+"""Start of a training from a trained simulator, also one of other materials, features, parameters or another domain: what fits is copied, the rest stays new.
+
+Weights and statistics are matched by name. A material that the trained simulator does not know takes those of a known one (``source_materials``). A tensor fits
+if it has the same shape. Weights that read material parameters are matched by the names of the parameters. Those of other parameters become zero, so that
+predictions do not depend on them at first.
+
+Statistics are copied if both simulators have the same dimension, frame interval and spacing. Otherwise the new ones are kept, because motion in units of its
+statistics is alike at all scales.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from gpe_pl.learned.checkpoint_file import CheckpointError
+from gpe_pl.nn.blocks import Standardize
+from gpe_pl.schema import MESH_MATERIALS
+from gpe_pl.trajectory.scene_ranges import united
+
+if TYPE_CHECKING:
+    from gpe_pl.learned.simulator import LearnedSimulator
+
+log = logging.getLogger(__name__)
+
+SHOWN = 5
+"""Number of new tensors that are named in messages."""
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """What a simulator took from a trained one.
+
+    Attributes:
+        sources: for each material, the material of the trained simulator whose weights it has.
+        new: parameters of the model that are new, at least in part, by name.
+        num_copied, num_weights: number of weights that were copied, and of all weights.
+    """
+
+    sources: dict[str, str]
+    new: dict[str, nn.Parameter]
+    num_copied: int
+    num_weights: int
+
+    def __str__(self) -> str:
+        renamed = [f"{material} from {source}" for material, source in self.sources.items() if material != source]
+        names = [*self.new][:SHOWN] + ([f"{len(self.new) - SHOWN} more"] if len(self.new) > SHOWN else [])
+        parts = [f"copied {self.num_copied:,} of {self.num_weights:,} weights", *renamed, f"new: {', '.join(names) or 'none'}"]
+        return "; ".join(parts)
+
+
+def check_model(new: LearnedSimulator, trained: LearnedSimulator) -> None:
+    """Raise an error if the networks have other settings.
+
+    Raises:
+        CheckpointError: the message names the settings to choose.
+    """
+    if different := _different(new, trained, "model."):
+        raise CheckpointError(f"the model to start from is another one; choose {' '.join(different)}")
+
+
+@torch.no_grad()
+def start_from(new: LearnedSimulator, trained: LearnedSimulator) -> Transfer:
+    """Copy to a new simulator, whose statistics are set, what fits of the weights and statistics of a trained one, and log what was copied and what is new.
+
+    Trained ranges then cover both trainings, for materials that both have with the same parameters.
+
+    Raises:
+        CheckpointError: the networks have other settings (``check_model``).
+    """
+    check_model(new, trained)
+    if different := _different(new, trained, "graph."):
+        log.warning("start_from: the trained model has other graphs, with %s; choose these to continue it unchanged", " ".join(different))
+    sources = source_materials(new.builder.spec.materials, trained.builder.spec.materials)
+    transfer = _copy_weights(new, trained, sources)
+    if _same_scales(new, trained):
+        _copy_statistics(new, trained, sources)
+    else:
+        log.warning(
+            "start_from: the trained model has another dimension, frame interval or spacing, so statistics are those of the new data"
+        )
+    new.set_units_of(new.model)
+    _unite_ranges(new, trained)
+    log.info("start_from: %s", transfer)
+    return transfer
+
+
+def source_materials(materials: Sequence[str], trained: Sequence[str]) -> dict[str, str]:
+    """Return for each material the trained one whose weights it takes: itself, else the first of its kind (with a mesh or without), else the first."""
+    chosen = {}
+    for material in materials:
+        alike = [t for t in trained if (t in MESH_MATERIALS) == (material in MESH_MATERIALS)]
+        chosen[material] = material if material in trained else (alike or [*trained])[0]
+    return chosen
+
+
+def _source_name(name: str, sources: dict[str, str]) -> str:
+    """Return the name in the trained simulator of a tensor, in whose name materials may stand, alone or in relations."""
+    return ".".join("__".join(sources.get(part, part) for part in place.split("__")) for place in name.split("."))
+
+
+def _different(new: LearnedSimulator, trained: LearnedSimulator, part: str) -> list[str]:
+    there, now = _choices(trained), _choices(new)
+    return [f"{key}={value}" for key, value in there.items() if key.startswith(part) and now.get(key) != value]
+
+
+def _choices(simulator: LearnedSimulator) -> dict[str, str]:
+    """Return the overrides that choose this model and these graphs. The radius is given in spacings, also if it is the default of the data set."""
+    own, scales = simulator.description(), simulator.builder.scales
+    spacings = {"connectivity_spacings": float(f"{scales.radius / scales.spacing:.6g}")}
+    parts = {"model": {"_target_": own["model"], **own["settings"]}, "graph": own["graph"] | spacings}
+    return {
+        f"{part}.{key}": value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+        for part, values in parts.items()
+        for key, value in values.items()
+    }
+
+
+def _same_scales(new: LearnedSimulator, trained: LearnedSimulator) -> bool:
+    here, there = new.builder.metadata, trained.builder.metadata
+    return here.dim == there.dim and abs(here.frame_dt / there.frame_dt - 1) < 1e-6 and abs(here.spacing / there.spacing - 1) < 0.01
+
+
+def _parameters(simulator: LearnedSimulator, material: str) -> list[str]:
+    return [p.name for p in simulator.builder.spec.parameters[material]]
+
+
+def _copy_weights(new: LearnedSimulator, trained: LearnedSimulator, sources: dict[str, str]) -> Transfer:
+    theirs = trained.model.state_dict()
+    reading = {name: material for material, name in new.model.parameter_weights().items()}
+    for name, buffer in new.model.named_buffers():
+        _copied(buffer, theirs.get(_source_name(name, sources)))
+    fresh: dict[str, nn.Parameter] = {}
+    num_copied = num_weights = 0
+    for name, own in new.model.named_parameters():
+        source, num_weights = theirs.get(_source_name(name, sources)), num_weights + own.numel()
+        if name in reading:
+            material = reading[name]
+            here, there = _parameters(new, material), _parameters(trained, sources[material])
+            own.zero_()
+            copied = own.numel() * _copy_columns(own, source, here, there) // len(here)
+        else:
+            copied = own.numel() * _copied(own, source)
+        num_copied += copied
+        if copied < own.numel():
+            fresh[name] = own
+    return Transfer(sources, fresh, num_copied, num_weights)
+
+
+def _copy_statistics(new: LearnedSimulator, trained: LearnedSimulator, sources: dict[str, str]) -> None:
+    theirs = {name: m for name, m in trained.standardizer.named_modules() if isinstance(m, Standardize) and not m.is_identity}
+    for name, own in new.standardizer.named_modules():
+        source = theirs.get(_source_name(name, sources))
+        if not isinstance(own, Standardize) or source is None:
+            continue
+        material = name.removeprefix("params.")
+        if material != name:
+            names = _parameters(new, material), _parameters(trained, sources[material])
+            _copy_columns(own.mean, source.mean, *names)
+            _copy_columns(own.std, source.std, *names)
+        elif own.mean.shape == source.mean.shape:
+            own.load_state_dict(source.state_dict())
+    new.acceleration_std.copy_(trained.acceleration_std)
+    if all(material == source for material, source in sources.items()):  # masses and stresses of others have other units
+        new.standardizer.mass.copy_(trained.standardizer.mass)
+        new.stress_std.copy_(trained.stress_std)
+    new.forget_known_statistics()
+
+
+def _copied(own: Tensor, theirs: Tensor | None) -> bool:
+    """Copy a tensor into another one of the same shape, and return whether there was one to copy."""
+    if theirs is None or theirs.shape != own.shape:
+        return False
+    own.copy_(theirs)
+    return True
+
+
+def _copy_columns(own: Tensor, theirs: Tensor | None, names: Sequence[str], their_names: Sequence[str]) -> int:
+    """Copy the columns of the parameters that both tensors [..., param] have, by name, and return their number."""
+    if theirs is None or theirs.shape[:-1] != own.shape[:-1]:
+        return 0
+    known = [name for name in names if name in their_names]
+    for name in known:
+        own[..., names.index(name)] = theirs[..., their_names.index(name)]
+    return len(known)
+
+
+def _unite_ranges(new: LearnedSimulator, trained: LearnedSimulator) -> None:
+    before, known = dict(trained.trained_ranges()), [*trained.builder.spec.materials]
+    for k, (material, values) in enumerate(new.trained_ranges()):
+        if material not in known:
+            continue
+        masses, theirs = new.trained_mass[:, k], trained.trained_mass[:, known.index(material)]
+        masses.copy_(torch.stack([torch.minimum(masses[0], theirs[0]), torch.maximum(masses[1], theirs[1])]))
+        if _parameters(new, material) == _parameters(trained, material):
+            set_ranges = [r for r in (before[material], values.clone()) if bool(r.isfinite().all())]
+            if set_ranges:
+                values.copy_(torch.stack([torch.stack(set_ranges).amin(dim=0)[0], torch.stack(set_ranges).amax(dim=0)[1]]))
+    if new.trained_scene.shape == trained.trained_scene.shape:
+        new.trained_scene.copy_(torch.from_numpy(united([trained.trained_scene.cpu().numpy(), new.trained_scene.cpu().numpy()])))

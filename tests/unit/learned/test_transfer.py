@@ -1,0 +1,144 @@
+"""Simulators that start from one of other materials, features, parameters or another domain."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
+from gpe_pl.learned.transfer import source_materials
+from gpe_pl.models.base import LayersError
+from gpe_pl.models.cconv import ContinuousConvNet
+from gpe_pl.models.dpinet import DPINet
+from gpe_pl.models.gns import GNS
+from gpe_pl.models.gpe import GPE
+from gpe_pl.schema import node_code
+from gpe_pl.training.optimizer import train_only
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata
+from tests import scenes
+
+
+def simulator(metadata: Metadata, seed: int = 0, config: GraphConfig | None = None, **settings: Any) -> LearnedSimulator:
+    """Return a simulator with random weights, and with statistics of one random graph."""
+    torch.manual_seed(seed)
+    builder = GraphBuilder(config or GraphConfig(history=1, islands=True), metadata)
+    made = LearnedSimulator(GPE(builder.spec, **{"num_message_passing_steps": 2, "hidden_channels": 8, **settings}), builder)
+    graph = builder(scenes.state(60, metadata.materials, history=builder.config.history, seed=seed, dim=metadata.dim).to_torch())
+    for material in metadata.materials:
+        graph[material].target = (1.0 + seed) * torch.randn(graph[material].num_nodes, metadata.dim)
+    made.fit_statistics([graph])
+    return made.eval()
+
+
+def acceleration(trained: LearnedSimulator, state: State) -> Tensor:
+    """Return the acceleration of the only material [node, dim] in m/s²."""
+    (values,) = trained(trained.builder(state)).acceleration.values()
+    return values * trained.acceleration_std
+
+
+def with_material(state: State, material: str, value: float) -> State:
+    node_type = torch.full_like(state.node_type, node_code(material))
+    return replace(state, node_type=node_type, material_params=torch.full_like(state.material_params, value))
+
+
+def test_a_new_material_moves_as_the_known_one_whatever_its_parameter(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    sand, snow = simulator(scenes.metadata(("sand",))), simulator(scenes.metadata(("snow",)), seed=1)
+    sand.clamps_parameters = snow.clamps_parameters = False
+    transfer = snow.start_from(sand)
+    state = replace(scenes.state(seed=5), mass=scenes.state(seed=5).mass * 0 + 1.0).to_torch()
+    mean = float(sand.state_dict()["standardizer.params.sand.mean"])
+    known = acceleration(sand, with_material(state, "sand", mean))
+    for value in (4.0, 11.0):
+        torch.testing.assert_close(acceleration(snow, with_material(state, "snow", value)), known, rtol=1e-4, atol=1e-4)
+    assert (known - acceleration(sand, with_material(state, "sand", 2 * mean))).abs().max() > 1e-3
+    assert [*transfer.new] == ["material_embedding.snow.theta.weight"]
+    assert "snow from sand; new: material_embedding.snow.theta.weight" in caplog.text
+
+
+def test_a_further_parameter_leaves_what_is_known_of_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    one, two = scenes.metadata(("sand",)), replace(scenes.metadata(("sand",)), param_names=("friction_angle", "cohesion"))
+    trained, new = simulator(one), simulator(one, seed=1)
+    builder = GraphBuilder(GraphConfig(history=1, islands=True), two)
+    new = LearnedSimulator(GPE(builder.spec, num_message_passing_steps=2, hidden_channels=8), builder).eval()
+    new.state_dict()["standardizer.params.sand.mean"].copy_(torch.tensor([1.0, 500.0]))
+    trained.clamps_parameters = new.clamps_parameters = False
+    transfer = new.start_from(trained)
+    state = scenes.state(seed=5).to_torch()
+    both = torch.cat([state.material_params, torch.full((state.num_nodes, 1), 800.0)], dim=1)
+    known = acceleration(trained, state)
+    torch.testing.assert_close(acceleration(new, replace(state, material_params=both)), known, rtol=1e-4, atol=1e-4)
+    assert float(new.state_dict()["standardizer.params.sand.mean"][1]) == 500.0
+    assert transfer.num_weights - transfer.num_copied == 8
+
+
+def test_other_features_start_with_new_encoders(caplog: pytest.LogCaptureFixture) -> None:
+    metadata = scenes.metadata()
+    trained, new = simulator(metadata), simulator(metadata, 1, GraphConfig(history=3, islands=True))
+    before = {name: value.clone() for name, value in new.named_buffers()}
+    transfer = new.start_from(trained)
+    assert [*transfer.new] == ["node_encoder.sand.0.weight"]
+    assert "choose these to continue it unchanged" in caplog.text and "graph.history=1" in caplog.text
+    now, there = new.state_dict(), trained.state_dict()
+    assert torch.equal(now["standardizer.node.sand.mean"], before["standardizer.node.sand.mean"])
+    assert torch.equal(now["standardizer.node.boundary.mean"], there["standardizer.node.boundary.mean"])
+    assert torch.equal(now["model.convs.1.sand__radius__sand.lin_in.weight"], there["model.convs.1.sand__radius__sand.lin_in.weight"])
+
+
+@pytest.mark.parametrize("change", [{"frame_dt": 0.01}, {"spacing": 0.1}, {"dim": 3}])
+def test_other_scales_have_their_own_statistics(change: dict[str, Any], caplog: pytest.LogCaptureFixture) -> None:
+    metadata = scenes.metadata(dim=change.get("dim", 2))
+    trained = simulator(scenes.metadata())
+    new = simulator(replace(metadata, **{k: v for k, v in change.items() if k != "dim"}), seed=1)
+    before, weight = {name: value.clone() for name, value in new.standardizer.state_dict().items()}, "model.updates.0.sand.0.weight"
+    new.start_from(trained)
+    torch.testing.assert_close(new.standardizer.state_dict(), before, rtol=0, atol=0)
+    assert torch.equal(new.state_dict()[weight], trained.state_dict()[weight])
+    assert float(new.acceleration_std) > 1.5 * float(trained.acceleration_std)
+    assert "statistics are those of the new data" in caplog.text
+
+
+def test_another_network_is_refused_and_nothing_is_changed() -> None:
+    trained, new = simulator(scenes.metadata()), simulator(scenes.metadata(("snow",)), seed=1, hidden_channels=4)
+    before = {name: value.clone() for name, value in new.state_dict().items()}
+    with pytest.raises(CheckpointError, match="choose model.hidden_channels=8$"):
+        new.start_from(trained)
+    torch.testing.assert_close(new.state_dict(), before, rtol=0, atol=0)
+
+
+def test_materials_take_the_weights_of_their_kind() -> None:
+    assert source_materials(("snow", "elastomer"), ("sand", "solid")) == {"snow": "sand", "elastomer": "solid"}
+    assert source_materials(("snow", "sand"), ("sand", "snow")) == {"snow": "snow", "sand": "sand"}
+    assert source_materials(("elastomer",), ("sand", "snow")) == {"elastomer": "sand"}
+
+
+def test_only_early_layers_and_new_weights_are_trained() -> None:
+    sand, snow = simulator(scenes.metadata(("sand",))), simulator(scenes.metadata(("snow",)), seed=1)
+    model, new = snow.model, snow.start_from(sand).new
+    train_only(model, model.early_layers(1), new.values())
+    trained = {name.split(".")[0] + "." + name.split(".")[1] for name, p in model.named_parameters() if p.requires_grad}
+    assert trained == {"material_embedding.snow", "node_encoder.snow", "node_encoder.boundary", "edge_encoder.boundary__radius__snow",
+                       "edge_encoder.snow__radius__snow", "convs.0", "updates.0"}  # fmt: skip
+    train_only(model, model.early_layers(0), [dict(model.named_parameters())["node_decoder.snow.0.weight"]])
+    assert {name for name, p in model.named_parameters() if p.requires_grad and "encoder" not in name} == {
+        "material_embedding.snow.theta.weight", "material_embedding.snow.theta.bias", "node_decoder.snow.0.weight"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("model", [GNS, ContinuousConvNet, DPINet])
+def test_early_layers_of_other_models(model: Any) -> None:
+    made = model(scenes.builder(history=1).spec)
+    if model is DPINet:
+        with pytest.raises(LayersError, match="choose training.early_layers=null"):
+            made.early_layers(1)
+        return
+    count = [sum(p.numel() for layer in made.early_layers(n) for p in layer.parameters()) for n in (0, 1, 2, 99)]
+    assert 0 < count[0] < count[1] < count[2] <= count[3] <= sum(p.numel() for p in made.parameters())
