@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gpe_pl.benchmarks import outside
-from gpe_pl.benchmarks.outside import Curve, OutsideError, deviation, drop_radius, measured_fronts, run_out
+from gpe_pl.benchmarks.outside import engines, suite
+from gpe_pl.benchmarks.outside.experiments import DAM_BREAK_FILE, Curve, OutsideError, deviation, drop_radius, measured_fronts, run_out
 
 
 def test_run_out_is_that_of_the_published_fit() -> None:
@@ -30,7 +31,7 @@ def test_deviations_count_only_points_that_the_run_reaches() -> None:
 
 
 def test_fronts_are_read_by_series_and_in_order(tmp_path: Path) -> None:
-    path = tmp_path / outside.DAM_BREAK_FILE
+    path = tmp_path / DAM_BREAK_FILE
     path.write_text("series,T,Z\na,2,3\nb,0,1\na,1,2\n")
     a, b = measured_fronts(path)
     assert (a.series, a.x.tolist(), a.y.tolist(), b.series) == ("a", [1.0, 2.0], [2.0, 3.0], "b")
@@ -40,16 +41,18 @@ def test_fronts_are_read_by_series_and_in_order(tmp_path: Path) -> None:
 
 
 def test_the_report_names_what_is_missing_and_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outside, "ENGINES", {"no_such_engine.part": ("Engine", "pip install engine")})
+    monkeypatch.setitem(
+        engines.SCENES, "calculix", replace(engines.SCENES["calculix"], label="Engine", remedy="install it", is_missing=lambda: True)
+    )
     (tmp_path / "data_FluidFall").mkdir()
-    missing = outside._missing(tmp_path, ["dam_break"])
+    missing = suite.missing_things(tmp_path, suite.Settings({}, experiments=["dam_break"], engines=["calculix"]))
     names = [name for name, _ in missing]
     assert names[0].startswith("measured fronts of dam breaks") and "Engine" in names and not any("FluidFall" in name for name in names)
     line = Curve("solver", np.array([1.0, 3.0]), np.array([1.0, 3.0]))
     curves = [Curve("law", np.array([2.0]), np.array([4.0])), line, Curve("model", np.array([1.0, 3.0]), np.array([np.nan, np.nan]))]
     records = [{"experiment": "droplet", "model": "m", "series": c.series, "x": c.x.tolist(), "y": c.y.tolist()} for c in curves]
-    text = outside._report(records, missing, tmp_path)
+    text = suite.report(records, missing, tmp_path)
     assert "| droplet | m | law | 1 | 50.0 % | not measured |" in text
-    assert "- Engine: pip install engine" in text
+    assert "- Engine: install it" in text
     assert f"source={tmp_path / 'data_FluidFall'} name=data_fluidfall leave_out=0" in text
-    assert outside.figures(records).keys() == {"droplet_m"}
+    assert suite.figures(records).keys() == {"droplet_m"}

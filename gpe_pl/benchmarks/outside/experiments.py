@@ -1,6 +1,4 @@
-"""The suite of other people's physics: experiments and published scaling laws beside solver and model, and what can be compared besides.
-
-Nothing is fetched from a network. The suite uses files in a folder of the user and installed packages, and names what is missing and how to get it.
+"""Published experiments and scaling laws beside solver and model.
 
 - ``dam_break``: front of a collapsing column of water, Martin and Moyce 1952 and Koshizuka and Oka 1996, as Z = z/a over T = t √(2g/a) with the width a.
 - ``column_collapse``: run-out of columns of sand, Lube et al. 2005: Δl/l = 1.2 a for a < 1.8, otherwise 1.9 a^(2/3), with a the height over the half width l.
@@ -12,20 +10,16 @@ The first frames of a model are the solver's, because a model needs a history.
 from __future__ import annotations
 
 import csv
-import importlib.util
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
-from pydantic import Field
 
 from gpe_pl.benchmarks.acceptance import scenes
 from gpe_pl.benchmarks.acceptance.trial import Candidate, tried
-from gpe_pl.benchmarks.trained import Case, checkpoint_label, of_stored_frames
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.errors import GpeError
 from gpe_pl.files.markdown import table_row
@@ -55,41 +49,9 @@ DROP_RADIUS, DROP_HEIGHT = 4, 4
 SLUMPED = 0.2
 """Fraction of the time before which the radius of the drop is not compared: the law holds when inertia no longer matters."""
 
-ENGINES = {
-    "KratosMultiphysics.MPMApplication": ("Kratos MPM", "pip install KratosMPMApplication"),
-    "pysplishsplash": ("SPlisHSPlasH", "pip install pysplishsplash"),
-}
-"""Other engines by module: name, and how to get them."""
-PUBLIC = {
-    "data_FluidFall": "DPI-Net's FluidFall, github.com/YunzhuLi/DPI-Net",
-    "data_BoxBath": "DPI-Net's BoxBath, github.com/YunzhuLi/DPI-Net",
-    "data_RiceGrip": "DPI-Net's RiceGrip, github.com/YunzhuLi/DPI-Net",
-    "data_RigidFall": "VGPL's RigidFall, github.com/YunzhuLi/VGPL-Dynamics-Prior",
-}
-"""Public data sets by the names of their folders."""
-
 
 class OutsideError(GpeError, ValueError):
     """Raised when a checkpoint was trained on none of the suite's data sets, or a file of the user cannot be read; the message names it."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of the suite.
-
-    Attributes:
-        cases: data sets, by name; each checkpoint must have been trained on one of them.
-        folder: folder of the user's files.
-        checkpoints: models as paths of checkpoints, folders of runs, or names of shipped models.
-        experiments: experiments to run.
-        num_threads: threads of PyTorch; the solvers use one.
-    """
-
-    cases: dict[str, Case]
-    folder: str = "outside"
-    checkpoints: Annotated[list[str], Field(min_length=1)] = field(default_factory=lambda: ["fluid", "sand"])
-    experiments: list[Experiment] = field(default_factory=lambda: ["dam_break", "column_collapse", "droplet"])
-    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
 
 
 @dataclass(frozen=True)
@@ -121,55 +83,16 @@ AXES: dict[str, Axes] = {
 }
 
 
-def run(settings: Settings, specs: Mapping[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
-    """Return a record per curve and per missing thing, and a Markdown report.
-
-    Raises:
-        OutsideError: a checkpoint was trained on none of ``specs``, or a file of the user cannot be read.
-    """
-    torch.set_num_threads(settings.num_threads)
-    folder = Path(settings.folder).expanduser()
-    candidates = [_candidate(checkpoint, specs) for checkpoint in settings.checkpoints]
-    records = list[dict[str, Any]]()
-    for experiment in settings.experiments:
-        measure, material = MEASURED[experiment]
-        for candidate in [c for c in candidates if scenes.material_of(c.spec) == material]:
-            log.info("%s: %s", experiment, candidate.name)
-            for curve in measure(candidate, folder):
-                about = {"experiment": experiment, "model": candidate.name, "series": curve.series}
-                records.append(about | {"x": curve.x.round(6).tolist(), "y": curve.y.round(6).tolist()})
-    missing = _missing(folder, settings.experiments)
-    records += [{"missing": name, "remedy": remedy} for name, remedy in missing]
-    return records, _report(records, missing, folder)
-
-
-def _candidate(checkpoint: str, specs: Mapping[str, DatasetSpec]) -> Candidate:
-    simulator = of_stored_frames(checkpoint)
-    own = simulator.builder.metadata
-    fitting = [s for s in specs.values() if s.name == own.dataset and abs(s.scene.spacing / own.spacing - 1) < 0.01]
-    if not fitting or len(own.materials) > 1:
-        raise OutsideError(f"{checkpoint}: was trained on {own.dataset}, the suite has {', '.join(specs)}; add the data set to suite.cases")
-    return Candidate(checkpoint_label(checkpoint), simulator, fitting[0])
-
-
-def _missing(folder: Path, experiments: Sequence[str]) -> list[tuple[str, str]]:
-    """Return what is not there, each with how to get it."""
-    found = []
-    if "dam_break" in experiments and not (folder / DAM_BREAK_FILE).is_file():
-        found.append(
-            (
-                f"measured fronts of dam breaks, {folder / DAM_BREAK_FILE}",
-                "columns series, T, Z; from the papers named in gpe_pl.benchmarks.outside",
-            )
-        )
-    for module, (name, remedy) in ENGINES.items():
-        if importlib.util.find_spec(module.partition(".")[0]) is None:
-            found.append((name, remedy))
-    found += [(about, f"put its folder into {folder}") for name, about in PUBLIC.items() if not (folder / name).is_dir()]
-    return found
-
-
-# --- experiments ----------------------------------------------------------------------------------------------------------------------------
+def compared(experiment: Experiment, candidate: Candidate, folder: Path) -> list[dict[str, Any]]:
+    """Return a record per curve of an experiment; none if the model has another material."""
+    measure, material = MEASURED[experiment]
+    if scenes.material_of(candidate.spec) != material:
+        return []
+    log.info("%s: %s", experiment, candidate.name)
+    return [
+        {"experiment": experiment, "model": candidate.name, "series": c.series, "x": c.x.round(6).tolist(), "y": c.y.round(6).tolist()}
+        for c in measure(candidate, folder)
+    ]
 
 
 def _dam_break(candidate: Candidate, folder: Path) -> list[Curve]:
@@ -177,7 +100,7 @@ def _dam_break(candidate: Candidate, folder: Path) -> list[Curve]:
     low, high = np.array(spec.scene.bounds, float).T
     spacing, width = spec.scene.spacing, DAM_WIDTH * (high - low)[0]
     size = [width, *(high - low)[1:-1], 2 * width]
-    trial = tried(candidate, value, _filled(spec, value, low, np.round(np.array(size) / spacing).astype(int)), DAM_SECONDS)
+    trial = tried(candidate, value, filled(spec, value, low, np.round(np.array(size) / spacing).astype(int)), DAM_SECONDS)
     curves = measured_fronts(folder / DAM_BREAK_FILE) if (folder / DAM_BREAK_FILE).is_file() else []
     gravity = abs(spec.scene.gravity[-1])
     fronts = {
@@ -185,7 +108,7 @@ def _dam_break(candidate: Candidate, folder: Path) -> list[Curve]:
         for series, trajectory in (("solver", trial.truth), ("model", trial.model))
     }
     free = int((np.maximum.accumulate(fronts["solver"]) < NEAR_WALL * (high - low)[0]).sum())  # the experiments have no wall there
-    times = _times(trial.truth) * np.sqrt(2 * gravity / width)
+    times = times_of(trial.truth) * np.sqrt(2 * gravity / width)
     return curves + [Curve(series, times[: len(front)][:free], front[:free] / width) for series, front in fronts.items()]
 
 
@@ -240,7 +163,7 @@ def _droplet(candidate: Candidate, _: Path) -> list[Curve]:
     curves = []
     for series, trajectory in (("solver", trial.truth), ("model", trial.model)):
         radius = np.quantile(np.linalg.norm(trajectory.pos[..., :2] - floor[:2], axis=-1), FRONT, axis=1) + spacing / 2
-        curves.append(Curve(series, _times(trajectory), radius))
+        curves.append(Curve(series, times_of(trajectory), radius))
     times = np.linspace(SLUMPED, 1.0, 20) * DROP_SECONDS
     return [Curve("Huppert 1982", times, drop_radius(times, volume, value, gravity)), *curves]
 
@@ -258,15 +181,16 @@ MEASURED: dict[str, tuple[Callable[[Candidate, Path], list[Curve]], str]] = {
 """Function and material of each experiment."""
 
 
-def _filled(spec: DatasetSpec, value: float, low: np.ndarray, counts: np.ndarray) -> State:
-    """Return jittered particles at rest that fill a box of ``counts`` particles per axis at a corner of the domain."""
+def filled(spec: DatasetSpec, value: float, low: np.ndarray, counts: np.ndarray, jitter: float = JITTER) -> State:
+    """Return particles at rest, up to ``jitter`` spacings from a lattice, in a box of ``counts`` particles per axis at a corner of the domain."""
     lattice = integer_lattice(np.zeros(len(counts), int), counts - 1) + 0.5
-    pos = low + spec.scene.spacing * (lattice + np.random.default_rng(0).uniform(-JITTER, JITTER, lattice.shape))
+    pos = low + spec.scene.spacing * (lattice + np.random.default_rng(0).uniform(-jitter, jitter, lattice.shape))
     walls = domain_walls(spec.scene.bounds, spec.scene.friction)  # type: ignore[attr-defined]
     return scenes.start(spec, value, pos, np.zeros(len(counts)), walls)
 
 
-def _times(trajectory: Trajectory) -> np.ndarray:
+def times_of(trajectory: Trajectory) -> np.ndarray:
+    """Return the time of each frame [s]."""
     return trajectory.start_time + trajectory.metadata.frame_dt * np.arange(trajectory.num_frames)
 
 
@@ -290,9 +214,13 @@ def _curves(records: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str], list[
     return found
 
 
-def _report(records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, str]], folder: Path) -> str:
+def report(records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the lines of a table of deviations from the references; none without experiments."""
+    curves_of = _curves(records)
+    if not curves_of:
+        return []
     lines = [table_row(["experiment", "model", "reference", "points", "solver", "model"]), "|" + "---|" * 6]
-    for (experiment, model), curves in _curves(records).items():
+    for (experiment, model), curves in curves_of.items():
         by_name = {curve.series: curve for curve in curves}
         for reference in [curve for curve in curves if curve.series not in ("solver", "model")]:
             values = [deviation(by_name[series], reference) for series in ("solver", "model")]
@@ -301,28 +229,18 @@ def _report(records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, s
     lines += [
         "",
         "Mean relative deviation from the points of the reference that the rollout reaches. The model's first frames are the solver's.",
+        "",
     ]
-    lines += [
-        f"- {experiment}: {axes.difference}." for experiment, axes in AXES.items() if any(experiment == key for key, _ in _curves(records))
+    return lines + [
+        f"- {experiment}: {axes.difference}." for experiment, axes in AXES.items() if any(experiment == key for key, _ in curves_of)
     ]
-    commands = [
-        f"`python -m gpe_pl.convert format=dpinet source={folder / name} name={name.lower()} leave_out=0`, then "
-        f"`python -m gpe_pl.fit data=imported data.name={name.lower()} name={name.lower()}`"
-        for name in PUBLIC
-        if (folder / name).is_dir()
-    ]
-    if commands:
-        lines += ["", "Public data sets that are there; train and evaluate on them with:", "", *(f"- {command}" for command in commands)]
-    if missing:
-        lines += ["", "Missing, and how to get it:", "", *(f"- {name}: {remedy}" for name, remedy in missing)]
-    return "\n".join(lines)
 
 
-def figures(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
+def drawn(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
     """Draw one figure per experiment and model: experiment or law, solver and model on the same axes."""
     from gpe_pl.viz.film_strip import new_figure
 
-    drawn = {}
+    found = {}
     for (experiment, model), curves in _curves(records).items():
         figure = new_figure(5.2, 3.6)
         figure.set_layout_engine("constrained")
@@ -341,5 +259,5 @@ def figures(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
             axes.plot(curve.x[shown], curve.y[shown], label=curve.series.replace("_", " "), **style)
         axes.set(xlabel=AXES[experiment].x, ylabel=AXES[experiment].y, title=f"{experiment.replace('_', ' ')}, {model}")
         axes.legend(fontsize="small")
-        drawn[f"{experiment}_{model}"] = figure
-    return drawn
+        found[f"{experiment}_{model}"] = figure
+    return found

@@ -1,0 +1,133 @@
+"""CalculiX as an engine for solids in plane strain: implicit dynamics (HHT-α) of the same mesh, with contact to the floor by penalty.
+
+Each triangle becomes a wedge of one spacing in depth, whose nodes do not move along the depth. The material is the neo-Hookean one of ``*HYPERELASTIC``::
+
+    Ψ = μ/2 (J^(-2/3) tr C - 3) + κ/2 (J - 1)²,   κ = λ + 2μ/3
+
+It equals the law of ``solvers.fem`` for small strains. Masses are consistent, not lumped, and damping is proportional to the stiffness as in ``solvers.fem``.
+Only the floor takes part in contact: a scene must keep the body away from the other walls.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.benchmarks.outside.engine import EngineError, last_lines
+from gpe_pl.solvers.fem import FEM
+from gpe_pl.solvers.fem.elements import build_mesh
+from gpe_pl.solvers.materials import lame_parameters
+from gpe_pl.trajectory.state import State
+
+PROGRAM = "ccx"
+INCREMENTS = 20
+"""Time steps of the engine within a frame."""
+STIFFNESS = 2.0
+"""Penalty of contact, as a multiple of Young's modulus over the spacing."""
+SECONDS = 600
+"""A run that takes longer is stopped."""
+
+
+def is_missing() -> bool:
+    """Tell whether the program is not on the path."""
+    return shutil.which(PROGRAM) is None
+
+
+def run(state: State, solver: FEM, num_frames: int) -> np.ndarray:
+    """Return positions [frame, node, 2] in m; the first frame is ``state``.
+
+    Args:
+        state: one body of triangles above the floor of a box, whose friction is that of the floor.
+        solver: solver whose Poisson's ratio, damping and frames are used.
+        num_frames: number of frames, the first one included.
+
+    Raises:
+        EngineError: the engine failed or stopped early; the message has its last lines.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "scene.inp").write_text(deck(state, solver, num_frames), encoding="ascii")
+        try:
+            done = subprocess.run([PROGRAM, "-i", "scene"], cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False)
+        except subprocess.TimeoutExpired:
+            raise EngineError(f"CalculiX: took longer than {SECONDS} s") from None
+        table = Path(folder, "scene.dat")
+        frames = displacements(table.read_text(encoding="ascii"), state.num_nodes) if table.is_file() else np.empty((0, state.num_nodes, 2))
+    if len(frames) != num_frames - 1:
+        raise EngineError(f"CalculiX: has {len(frames)} of {num_frames - 1} frames; its last lines are: {last_lines(done.stdout)}")
+    return np.concatenate([state.pos[None], state.pos + frames])
+
+
+def displacements(text: str, num_nodes: int) -> np.ndarray:
+    """Return displacements [frame, node, 2] from a ``.dat`` file, which has a heading and a line per node and frame."""
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("displacements")]
+    whole = len(rows) // num_nodes
+    values = np.array([[float(x) for x in row] for row in rows[: whole * num_nodes]]).reshape(whole, num_nodes, 4)
+    return values[:, :, 1:3]
+
+
+def deck(state: State, solver: FEM, num_frames: int) -> str:
+    """Return the input file of a scene."""
+    cells, pos = np.asarray(state.cells), np.asarray(state.pos)
+    count = len(pos)
+    mesh = build_mesh(pos, cells, np.asarray(state.mass))
+    area = float(mesh.weight.sum())
+    density = float(np.sum(state.mass)) / area
+    depth = float(np.sqrt(2 * area / len(cells)))
+    modulus = float(state.material_params[0, 0])
+    lam, mu = (float(value) for value in lame_parameters(modulus, solver.poisson_ratio))
+    damping = (
+        2 * solver.damping / float(np.sqrt(mesh.scale * (2 * mu + 2 * lam)))
+    )  # the fastest mode has the same fraction of the critical damping
+    low = solver.bounds[1][0]
+    left, right = solver.bounds[0]
+    friction = next(shape.friction for shape in state.boundary.shapes if abs(getattr(shape, "normal", (0, 0))[1] - 1) < 1e-9)
+    stiffness = STIFFNESS * modulus / depth
+    floor = np.array(
+        [(x, y, z) for y in (low - depth, low) for x, z in ((left, -depth), (right, -depth), (right, 2 * depth), (left, 2 * depth))]
+    )
+    # a wedge's corners run around the axis from the first triangle to the second
+    nodes = np.concatenate([np.column_stack([pos, np.zeros(count)]), np.column_stack([pos, np.full(count, depth)]), floor])
+    wedges = np.concatenate([cells, cells + count], axis=1) + 1
+    box = 2 * count + np.array([1, 4, 3, 2, 5, 8, 7, 6])
+    skin = np.unique(mesh.edges)
+    step = solver.frame_dt / INCREMENTS
+    lines = ["*NODE, NSET=ALL", *(f"{i}, {x:.12e}, {y:.12e}, {z:.12e}" for i, (x, y, z) in enumerate(nodes, 1))]
+    lines += ["*ELEMENT, TYPE=C3D6, ELSET=BODY", *(", ".join(map(str, [i, *wedge])) for i, wedge in enumerate(wedges, 1))]
+    lines += ["*ELEMENT, TYPE=C3D8, ELSET=FLOOR", ", ".join(map(str, [len(wedges) + 1, *box]))]
+    lines += ["*NSET, NSET=FRONT, GENERATE", f"1, {count}", "*NSET, NSET=SOLID, GENERATE", f"1, {2 * count}"]
+    lines += ["*NSET, NSET=FIXED, GENERATE", f"{2 * count + 1}, {2 * count + 8}"]
+    lines += ["*MATERIAL, NAME=ELASTIC", "*HYPERELASTIC, NEO HOOKE", f"{mu / 2:.9e}, {2 / (lam + 2 * mu / 3):.9e}"]
+    lines += ["*DENSITY", f"{density:.9e}"]
+    lines += [f"*DAMPING, ALPHA=0., BETA={damping:.9e}"]
+    lines += ["*MATERIAL, NAME=RIGID", "*ELASTIC", f"{100 * modulus:.9e}, 0.3", "*DENSITY", f"{density:.9e}"]
+    lines += ["*SOLID SECTION, ELSET=BODY, MATERIAL=ELASTIC", "*SOLID SECTION, ELSET=FLOOR, MATERIAL=RIGID"]
+    lines += [
+        "*SURFACE, NAME=SKIN, TYPE=NODE",
+        *map(str, skin + 1),
+        *map(str, skin + count + 1),
+        "*SURFACE, NAME=TOP, TYPE=ELEMENT",
+        f"{len(wedges) + 1}, S2",
+    ]
+    lines += ["*SURFACE INTERACTION, NAME=TOUCH", "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR", f"{stiffness:.9e}"]
+    if friction > 0:
+        lines += ["*FRICTION", f"{min(friction, 10.0)}, {stiffness / 10:.9e}"]
+    lines += ["*CONTACT PAIR, INTERACTION=TOUCH, TYPE=NODE TO SURFACE", "SKIN, TOP"]
+    lines += ["*BOUNDARY", "SOLID, 3, 3", "FIXED, 1, 3"]
+    lines += ["*INITIAL CONDITIONS, TYPE=VELOCITY"]
+    lines += [
+        f"{i + 1 + shift}, {axis + 1}, {v:.9e}" for shift in (0, count) for i, vel in enumerate(state.vel) for axis, v in enumerate(vel)
+    ]
+    gravity = float(np.linalg.norm(state.gravity))
+    direction = np.asarray(state.gravity) / gravity
+    lines += [
+        f"*STEP, NLGEOM, INC={10 * INCREMENTS * num_frames}",
+        "*DYNAMIC, DIRECT",
+        f"{step:.9e}, {(num_frames - 1) * solver.frame_dt:.9e}",
+    ]
+    lines += ["*DLOAD", f"BODY, GRAV, {gravity:.9e}, {direction[0]:.9e}, {direction[1]:.9e}, 0."]
+    lines += [f"*NODE PRINT, NSET=FRONT, FREQUENCY={INCREMENTS}", "U", "*END STEP", ""]
+    return "\n".join(lines)

@@ -1,0 +1,203 @@
+"""The same scene by another engine, by the solver of a data set and by a model.
+
+- ``calculix``: a block of a solid that falls on a floor.
+- ``splishsplash``: a column of liquid that collapses in a box.
+
+Solver and engine start from the same state. The first frames of the model are the solver's, because a model needs a history.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from gpe_pl.benchmarks.acceptance import scenes
+from gpe_pl.benchmarks.acceptance.trial import Candidate, predicted
+from gpe_pl.benchmarks.outside import calculix, splishsplash
+from gpe_pl.benchmarks.outside.experiments import DAM_WIDTH, FRONT, filled
+from gpe_pl.files.markdown import table_row
+from gpe_pl.rollout.loop import rollout
+from gpe_pl.trajectory.state import State
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+log = logging.getLogger(__name__)
+
+EngineName = Literal["calculix", "splishsplash"]
+DROP_GAP, DROP_SPEED, DROP_SECONDS = 0.05, 1.0, 0.2
+"""Gap between the block and the floor [m], speed at the start [m/s], and duration [s]."""
+DAM_SECONDS = 0.3
+"""Duration of the collapse of a column of liquid [s]. The liquid does not reach the opposite wall."""
+
+Quantities = dict[str, Callable[[np.ndarray, Candidate], np.ndarray]]
+"""Lengths over time [frame] in m by name, from positions [frame, node, dim]."""
+
+
+def _centre(axis: int) -> Callable[[np.ndarray, Candidate], np.ndarray]:
+    return lambda pos, candidate: pos[..., axis].mean(axis=1) - candidate.spec.scene.bounds[axis][0]
+
+
+def _front(pos: np.ndarray, candidate: Candidate) -> np.ndarray:
+    return np.quantile(pos[..., 0], FRONT, axis=1) + candidate.spacing / 2 - candidate.spec.scene.bounds[0][0]
+
+
+@dataclass(frozen=True)
+class EngineScene:
+    """A scene that an engine can run.
+
+    Attributes:
+        label: name of the engine.
+        remedy: how to get it.
+        is_missing: tells whether it is not there.
+        material: material of the scene.
+        about: the scene in words.
+        start: initial state for a model, by its material parameter.
+        run: positions [frame, node, dim] in m by the engine, from the initial state and the number of frames.
+        seconds: duration of the scene [s].
+        quantities: what is compared.
+        points: whether the nodes are the same material points over the whole scene, so that their distance is compared too.
+        difference: how the engine's scene differs from the solver's.
+    """
+
+    label: str
+    remedy: str
+    is_missing: Callable[[], bool]
+    material: str
+    about: str
+    start: Callable[[Candidate, float], State]
+    run: Callable[[Candidate, State, int], np.ndarray]
+    seconds: float
+    quantities: Quantities
+    points: bool
+    difference: str
+
+
+def _block(candidate: Candidate, value: float) -> State:
+    return scenes.dropped_block(candidate.spec, value, 10, 8, DROP_GAP, DROP_SPEED)
+
+
+def _by_calculix(candidate: Candidate, state: State, num_frames: int) -> np.ndarray:
+    solver: Any = candidate.spec.solver
+    return calculix.run(state, solver, num_frames)
+
+
+def _dam(candidate: Candidate, value: float) -> State:
+    spec = candidate.spec
+    low, high = np.array(spec.scene.bounds, float).T
+    width = DAM_WIDTH * (high - low)[0]
+    size = np.array([width, *(high - low)[1:-1], 2 * width])
+    return filled(spec, value, low, np.round(size / spec.scene.spacing).astype(int), jitter=0.0)
+
+
+def _by_splishsplash(candidate: Candidate, state: State, num_frames: int) -> np.ndarray:
+    scene = candidate.spec.scene
+    return splishsplash.run(state, scene.bounds, scene.spacing, candidate.spec.solver.frame_dt, num_frames)
+
+
+SCENES: dict[str, EngineScene] = {
+    "calculix": EngineScene(
+        "CalculiX", "apt install calculix-ccx (Debian, Ubuntu), or the program ccx from calculix.de on the path", calculix.is_missing, "solid",
+        "a block of 10 × 8 squares falls on a floor", _block, _by_calculix, DROP_SECONDS,
+        {"height of the centre": _centre(1)}, True,
+        "implicit time steps, contact by penalty and consistent masses; ours has explicit steps, inelastic contact of nodes and lumped masses",
+    ),
+    "splishsplash": EngineScene(
+        "SPlisHSPlasH", "pip install pySPlisHSPlasH", splishsplash.is_missing, "fluid",
+        "a column of liquid collapses in a box", _dam, _by_splishsplash, DAM_SECONDS,
+        {"front": _front, "height of the centre": _centre(2)}, False,
+        "particles interact over two spacings without a grid, and walls are particles; ours has a grid of two spacings",
+    ),
+}  # fmt: skip
+"""Scenes by the names of their engines."""
+
+
+def compared(name: str, candidate: Candidate) -> list[dict[str, Any]]:
+    """Return a record per quantity of the scene of an engine; none if the model has another material.
+
+    A record has the values of ``engine``, ``solver`` and ``model`` over time. Those of a model that stopped early are shorter.
+
+    Raises:
+        EngineError: the engine failed.
+    """
+    scene = SCENES[name]
+    if scenes.material_of(candidate.spec) != scene.material:
+        return []
+    records = []
+    for value in candidate.values[::2] if scene.material == "fluid" else candidate.values[1:2]:
+        log.info("%s: %s", scene.label, candidate.described(value))
+        start, solver = scene.start(candidate, value), candidate.spec.solver
+        history = candidate.simulator.builder.config.history
+        count = history + max(2, round(scene.seconds / solver.frame_dt))
+        whole = rollout(solver, start, count, candidate.metadata())
+        model, _ = predicted(candidate, candidate.simulator.initial_state(whole, history), whole.frames(history))
+        by = {"engine": scene.run(candidate, start, count + 1)[history:], "solver": whole.pos[history:], "model": model.pos}
+        times = solver.frame_dt * (history + np.arange(len(by["solver"])))
+        about = {"engine_name": name, "model": candidate.name, "parameter": candidate.described(value), "spacing": candidate.spacing}
+        about |= {"x": times.round(6).tolist()}
+        for quantity, function in scene.quantities.items():
+            records.append(about | {"quantity": quantity} | {key: function(pos, candidate).round(6).tolist() for key, pos in by.items()})
+        if scene.points:
+            engine = by["engine"]
+            apart = {
+                key: np.linalg.norm(by[key] - engine[: len(by[key])], axis=-1).mean(axis=1).round(6).tolist() for key in ("solver", "model")
+            }
+            records.append(about | {"quantity": "distance of nodes from the engine's", "engine": [0.0] * len(engine)} | apart)
+    return records
+
+
+def difference(own: Sequence[float], other: Sequence[float], spacing: float) -> float:
+    """Return the mean difference of two curves over the frames of the shorter one, in spacings."""
+    count = min(len(own), len(other))
+    return float(np.mean(np.abs(np.array(own[:count]) - np.array(other[:count])))) / spacing
+
+
+def report(records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the lines of a table of differences; none without engines."""
+    of_engines = [record for record in records if "quantity" in record]
+    if not of_engines:
+        return []
+    names = ["engine", "material", "quantity", "range [spacings]", "solver − engine", "model − engine", "model − solver"]
+    lines = [table_row(names), "|" + "---|" * len(names)]
+    for r in of_engines:
+        spacing, whole = r["spacing"], len(r["model"]) == len(r["engine"])
+        spread = max(r["engine"]) - min(r["engine"])
+        model = [f"{difference(r['model'], r[key], spacing):.2f}" + ("" if whole else " until it stopped") for key in ("engine", "solver")]
+        is_apart = spread == 0
+        solver = f"{difference(r['solver'], r['engine'], spacing):.2f}"
+        cells = [
+            SCENES[r["engine_name"]].label,
+            r["parameter"],
+            r["quantity"],
+            "" if is_apart else f"{spread / spacing:.1f}",
+            solver,
+            model[0],
+        ]
+        lines.append(table_row([*cells, "" if is_apart else model[1]]))
+    lines += ["", "Mean difference over the frames, in spacings. The model's first frames are the solver's.", ""]
+    return lines + [
+        f"- {s.label}: {s.about}. {s.difference}." for name, s in SCENES.items() if any(r["engine_name"] == name for r in of_engines)
+    ]
+
+
+def drawn(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
+    """Draw one figure per engine: engine, solver and model over time, one panel per quantity and parameter."""
+    from gpe_pl.viz.film_strip import new_figure
+
+    found = {}
+    for name in dict.fromkeys(record["engine_name"] for record in records if "quantity" in record):
+        own = [r for r in records if r.get("engine_name") == name and max(r["engine"]) > 0]
+        figure = new_figure(3.4 * len(own), 3.0)
+        figure.set_layout_engine("constrained")
+        for axes, r in zip(np.ravel(figure.subplots(1, len(own))), own, strict=True):
+            for key, style in (("engine", ":"), ("solver", "-"), ("model", "--")):
+                axes.plot(r["x"][: len(r[key])], r[key], style, label=SCENES[name].label if key == "engine" else key)
+            axes.set_title(r["parameter"], fontsize="small")
+            axes.set(xlabel="t [s]", ylabel=f"{r['quantity']} [m]")
+            axes.legend(fontsize="small")
+        found[f"engine_{name}"] = figure
+    return found

@@ -1,0 +1,114 @@
+"""The suite of other people's physics: experiments, other engines and public data sets.
+
+Nothing is fetched from a network. The suite uses files in a folder of the user and installed programs, and names what is missing and how to get it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import torch
+from pydantic import Field
+
+from gpe_pl.benchmarks.acceptance.trial import Candidate
+from gpe_pl.benchmarks.outside import engines, experiments
+from gpe_pl.benchmarks.outside.engines import EngineName
+from gpe_pl.benchmarks.outside.experiments import DAM_BREAK_FILE, Experiment, OutsideError
+from gpe_pl.benchmarks.trained import Case, checkpoint_label, of_stored_frames
+from gpe_pl.data.ground_truth import DatasetSpec
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PUBLIC = {
+    "data_FluidFall": "DPI-Net's FluidFall, github.com/YunzhuLi/DPI-Net",
+    "data_BoxBath": "DPI-Net's BoxBath, github.com/YunzhuLi/DPI-Net",
+    "data_RiceGrip": "DPI-Net's RiceGrip, github.com/YunzhuLi/DPI-Net",
+    "data_RigidFall": "VGPL's RigidFall, github.com/YunzhuLi/VGPL-Dynamics-Prior",
+}
+"""Public data sets by the names of their folders."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the suite.
+
+    Attributes:
+        cases: data sets, by name; each checkpoint must have been trained on one of them.
+        folder: folder of the user's files.
+        checkpoints: models as paths of checkpoints, folders of runs, or names of shipped models.
+        experiments: experiments to run.
+        engines: other engines to run.
+        num_threads: threads of PyTorch; the solvers use one.
+    """
+
+    cases: dict[str, Case]
+    folder: str = "outside"
+    checkpoints: Annotated[list[str], Field(min_length=1)] = field(default_factory=lambda: ["fluid", "sand", "fem"])
+    experiments: list[Experiment] = field(default_factory=lambda: ["dam_break", "column_collapse", "droplet"])
+    engines: list[EngineName] = field(default_factory=lambda: ["calculix", "splishsplash"])
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
+
+
+def run(settings: Settings, specs: Mapping[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
+    """Return a record per curve, per quantity of an engine and per missing thing, and a Markdown report.
+
+    Raises:
+        OutsideError: a checkpoint was trained on none of ``specs``, or a file of the user cannot be read.
+        EngineError: an engine failed.
+    """
+    torch.set_num_threads(settings.num_threads)
+    folder = Path(settings.folder).expanduser()
+    candidates = [_candidate(checkpoint, specs) for checkpoint in settings.checkpoints]
+    records = [record for name in settings.experiments for c in candidates for record in experiments.compared(name, c, folder)]
+    present = [name for name in settings.engines if not engines.SCENES[name].is_missing()]
+    records += [record for name in present for c in candidates for record in engines.compared(name, c)]
+    missing = missing_things(folder, settings)
+    records += [{"missing": name, "remedy": remedy} for name, remedy in missing]
+    return records, report(records, missing, folder)
+
+
+def _candidate(checkpoint: str, specs: Mapping[str, DatasetSpec]) -> Candidate:
+    simulator = of_stored_frames(checkpoint)
+    own = simulator.builder.metadata
+    fitting = [s for s in specs.values() if s.name == own.dataset and abs(s.scene.spacing / own.spacing - 1) < 0.01]
+    if not fitting or len(own.materials) > 1:
+        raise OutsideError(f"{checkpoint}: was trained on {own.dataset}, the suite has {', '.join(specs)}; add the data set to suite.cases")
+    return Candidate(checkpoint_label(checkpoint), simulator, fitting[0])
+
+
+def missing_things(folder: Path, settings: Settings) -> list[tuple[str, str]]:
+    """Return what is not there, each with how to get it."""
+    found = []
+    if "dam_break" in settings.experiments and not (folder / DAM_BREAK_FILE).is_file():
+        remedy = "columns series, T, Z; from the papers named in gpe_pl.benchmarks.outside.experiments"
+        found.append((f"measured fronts of dam breaks, {folder / DAM_BREAK_FILE}", remedy))
+    for name in settings.engines:
+        if engines.SCENES[name].is_missing():
+            found.append((engines.SCENES[name].label, engines.SCENES[name].remedy))
+    found += [(about, f"put its folder into {folder}") for name, about in PUBLIC.items() if not (folder / name).is_dir()]
+    return found
+
+
+def report(records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, str]], folder: Path) -> str:
+    """Return the tables, and what is there besides and what is missing."""
+    parts = [experiments.report(records), engines.report(records)]
+    commands = [
+        f"`python -m gpe_pl.convert format=dpinet source={folder / name} name={name.lower()} leave_out=0`, then "
+        f"`python -m gpe_pl.fit data=imported data.name={name.lower()} name={name.lower()}`"
+        for name in PUBLIC
+        if (folder / name).is_dir()
+    ]
+    if commands:
+        parts.append(["Public data sets that are there; train and evaluate on them with:", "", *(f"- {command}" for command in commands)])
+    if missing:
+        parts.append(["Missing, and how to get it:", "", *(f"- {name}: {remedy}" for name, remedy in missing)])
+    return "\n\n".join("\n".join(part) for part in parts if part)
+
+
+def figures(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
+    """Draw one figure per experiment and model, and one per engine."""
+    return experiments.drawn(records) | engines.drawn(records)

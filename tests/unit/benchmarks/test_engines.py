@@ -1,0 +1,115 @@
+"""Other engines: their input and output files, their failures, and the table of differences. Runs of an engine are skipped where it is not installed."""
+
+from __future__ import annotations
+
+import os
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpe_pl.benchmarks.acceptance.scenes import block
+from gpe_pl.benchmarks.outside import calculix, engines, splishsplash
+from gpe_pl.benchmarks.outside.engine import EngineError
+from gpe_pl.geometry.shapes import domain_walls
+from gpe_pl.schema import node_code
+from gpe_pl.solvers.fem import FEM
+from gpe_pl.solvers.solid_scenes import lumped_masses
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
+
+UNIT_SQUARE, UNIT_CUBE = ((0.0, 1.0),) * 2, ((0.0, 1.0),) * 3
+SPACING = 0.05
+
+
+def falling_block(height: float, speed: float) -> State:
+    nodes, cells = block(4, 3)
+    pos = np.array([0.4, height]) + SPACING * nodes
+    return State(
+        pos, np.full(pos.shape, [0.0, -speed]), np.full(len(pos), node_code("solid"), np.uint8), lumped_masses(pos, cells, 1000.0),
+        np.full((len(pos), 1), 1e6), Boundary.sample(domain_walls(UNIT_SQUARE, 0.3), SPACING, 2), np.array([0.0, -9.81]),
+        rest_pos=pos.copy(), cells=cells,
+    )  # fmt: skip
+
+
+def cube_of_liquid(viscosity: float) -> State:
+    lattice = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5
+    pos = SPACING * lattice
+    return State(
+        pos, np.zeros_like(pos), np.full(len(pos), node_code("fluid"), np.uint8), np.full(len(pos), 1000 * SPACING**3),
+        np.full((len(pos), 1), viscosity), Boundary.empty(3), np.array([0.0, 0.0, -9.81]),
+    )  # fmt: skip
+
+
+def test_displacements_are_read_by_frame_and_node() -> None:
+    table = "\n displacements (vx,vy,vz) for set FRONT and time  0.1E-02\n\n 1 1.0E-01 2.0E-01 0.0\n 2 3.0E-01 4.0E-01 0.0\n\n"
+    frames = calculix.displacements(table + table.replace("1.0E-01", "5.0E-01") + table.partition(" 2 ")[0], 2)
+    np.testing.assert_allclose(frames, [[[0.1, 0.2], [0.3, 0.4]], [[0.5, 0.2], [0.3, 0.4]]])
+
+
+def test_a_deck_has_the_mesh_twice_its_material_and_its_skin() -> None:
+    state = falling_block(0.1, 1.0)
+    lines = calculix.deck(state, FEM(UNIT_SQUARE, 2e-3, poisson_ratio=0.25), 5).splitlines()
+    assert sum(len(line.split(",")) == 7 for line in lines) == len(state.cells)  # type: ignore[arg-type]
+    mu = 1e6 / 2.5
+    neo_hooke = [float(x) for x in lines[lines.index("*HYPERELASTIC, NEO HOOKE") + 1].split(",")]
+    np.testing.assert_allclose(neo_hooke, [mu / 2, 2 / (mu + 2 * mu / 3)])  # λ = μ for this ratio
+    skin = lines[lines.index("*SURFACE, NAME=SKIN, TYPE=NODE") + 1 : lines.index("*SURFACE, NAME=TOP, TYPE=ELEMENT")]
+    assert len(skin) == 2 * 14  # 2 (4 + 3) nodes of the outline, in both layers
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the program is a shell script")
+def test_a_failure_has_the_last_lines_of_the_engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "ccx"
+    program.write_text("#!/bin/sh\necho one\necho '*ERROR: solution seems to diverge'\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    with pytest.raises(EngineError, match=r"has 0 of 3 frames.*one / \*ERROR: solution seems to diverge"):
+        calculix.run(falling_block(0.1, 1.0), FEM(UNIT_SQUARE, 2e-3), 4)
+
+
+def test_points_are_big_endian_with_a_weight() -> None:
+    data = splishsplash.points_file(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
+    assert data[:5] == b"BgeoV" and struct.unpack(">2i", data[5:13]) == (5, 2)
+    np.testing.assert_array_equal(np.frombuffer(data[41:73], ">f4").reshape(2, 4), [[1, 2, 3, 1], [4, 5, 6, 1]])
+
+
+def record(model: list[float]) -> dict[str, object]:
+    about = {"engine_name": "calculix", "model": "m", "parameter": "E", "spacing": 0.5, "quantity": "height", "x": [0.0, 1.0]}
+    return about | {"engine": [1.0, 2.0], "solver": [1.5, 2.5], "model": model}
+
+
+def test_differences_are_means_in_spacings_until_a_model_stopped() -> None:
+    assert engines.difference([1.0, 2.0, 9.0], [1.5, 2.5], 0.5) == 1.0
+    whole = next(line for line in engines.report([record([2.0, 2.0])]) if line.startswith("| CalculiX"))
+    assert whole == "| CalculiX | E | height | 2.0 | 1.00 | 1.00 | 1.00 |"
+    assert "2.00 until it stopped" in "".join(engines.report([record([2.0])]))
+    assert engines.report([{"missing": "x"}]) == []
+    assert engines.drawn([record([2.0])]).keys() == {"engine_calculix"}
+
+
+@pytest.mark.slow
+def test_calculix_lets_a_block_fall_and_bounce() -> None:
+    if calculix.is_missing():
+        pytest.skip("ccx is not on the path")
+    solver = FEM(UNIT_SQUARE, 2e-3)
+    pos = calculix.run(falling_block(0.02, 1.0), solver, 40)
+    times = 2e-3 * np.arange(8)
+    np.testing.assert_allclose(
+        pos[:8] - pos[0], np.array([0.0, 1.0]) * (-times - 9.81 / 2 * times**2)[:, None, None] * np.ones((8, 20, 1)), atol=1e-6
+    )
+    height = pos[..., 1].mean(axis=1)
+    assert height[-1] > height.min() + 0.005 and pos[..., 1].min() > -0.1 * SPACING
+
+
+@pytest.mark.slow
+def test_splishsplash_spreads_a_thin_liquid_further_than_a_thick_one() -> None:
+    if splishsplash.is_missing():
+        pytest.skip("pysplishsplash is not installed")
+    thin, thick = (splishsplash.run(cube_of_liquid(v), UNIT_CUBE, SPACING, 5e-3, 30) for v in (2e-3, 0.5))
+    np.testing.assert_allclose(thin[0], cube_of_liquid(1.0).pos, atol=0.2 * SPACING)
+    assert thin.shape == thick.shape == (30, 64, 3)
+    assert thin[-1, :, 0].max() > 1.2 * thick[-1, :, 0].max()
+    assert (thin > -0.1 * SPACING).all() and (thin < 1 + 0.1 * SPACING).all()
