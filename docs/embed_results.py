@@ -36,7 +36,7 @@ PICTURES = (
     *("table1.png", "error_by_parameter.png", "validation_loss.png", "scaling.png", "showcase.png", "parameter_effect.png"),
     *("rollout_test_00.png", "rollout_test_unseen_00.png", "stress_test_unseen_00.png", "error_curve_test.png"),
     *("long_horizon_*.png", "perturbation_*.png", "cost_error_*.png"),
-    *("dam_break_*.png", "column_collapse_*.png", "droplet_*.png"),
+    "engines.png",
     *("acceptance_fem_beam.png", "acceptance_elastomer_square.png", "acceptance_sand_column.png"),
     "scenes/*_00_misfit.png",
     *("acceptance_snow_cylinder.png", "acceptance_fluid_dam_break.png", "acceptance_sand_slump.png"),

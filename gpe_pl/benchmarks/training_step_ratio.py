@@ -68,7 +68,7 @@ def _windows(simulator: LearnedSimulator, spec: DatasetSpec, training: TrainingS
     solver = cast(Restartable, spec.solver) if training.targets == "solver" else None
     unit = float(simulator.acceleration_std) * trajectory.metadata.frame_dt
     stress = bool(simulator.model.settings.get("stress", False))
-    return WindowDataset([stored], simulator.builder, training.noise, unit, 0, stress, solver, training.mirror)
+    return WindowDataset([stored], simulator.builder, training.noise, unit, 0, stress, solver, training.augmentation)
 
 
 def _seconds_of_products(simulator: LearnedSimulator, data: WindowDataset, size: BatchSize, num_rounds: int) -> float:

@@ -233,7 +233,7 @@ class FitRun:
             stress=bool(self.cfg.model.get("stress", False)),
             sampling=self.training.sampling,
             solver=self._solver,
-            mirror=self.training.mirror,
+            augmentation=self.training.augmentation,
             stride=self.stride,
             unroll_steps=self.training.unroll_steps or 1,
         )

@@ -14,6 +14,7 @@ import torch
 from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
 
+from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.dataset import (
     CachedGraphs,
@@ -84,14 +85,14 @@ class TrajectoryDataModule(L.LightningDataModule):
         graph: settings of the graphs.
         noise: noise on training inputs.
         batch_size: samples per step over all ranks. Its ``max_nodes`` also limits batches of validation windows.
-        seed: seed of order, noise and mirroring.
+        seed: seed of order, noise and augmentation.
         num_workers: number of processes that build graphs; 0 builds them in the training process.
         num_val_windows: number of windows of the one-step validation loss, evenly spread over the ``val`` split.
         stress: add the stress to samples; see ``WindowDataset``.
         sampling: how often each training window is drawn.
         num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
         solver: gives the targets of noisy and unrolled states; see ``WindowDataset``.
-        mirror: mirror training windows at random; see ``WindowDataset``.
+        augmentation: images of training windows.
         stride: number of stored frames in a frame of the model. Training windows begin at any stored frame, validation windows at every ``stride``-th.
         unroll_steps: number of steps of an unroll with gradients; see ``WindowDataset``.
 
@@ -100,6 +101,7 @@ class TrajectoryDataModule(L.LightningDataModule):
             graphs.
 
     Raises:
+        AugmentationError: the scenes do not have a symmetry of ``augmentation``.
         StoreError: a split or its statistics are missing or damaged, too many of its trajectories cannot be used, none is long enough for a window, or a node
             may move by half a period within a frame of this stride.
         NoiseError: the noise is too large for the spacing of the data.
@@ -118,7 +120,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         sampling: Sampling = "uniform",
         num_statistics_windows: int = 256,
         solver: Restartable | None = None,
-        mirror: bool = False,
+        augmentation: Augmentation = Augmentation(),  # noqa: B008
         stride: int = 1,
         unroll_steps: int = 1,
     ) -> None:
@@ -143,7 +145,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         self.builder = GraphBuilder(graph, self.metadata)
         unit = std * self.metadata.frame_dt
         noise.check(self.metadata, unit)
-        self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress, solver, mirror, unroll_steps)
+        self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress, solver, augmentation, unroll_steps)
         self.val_set = WindowDataset(val, self.builder, stress=stress)
         if sampling == "activity":
             self.train_set.probability = probabilities(self.train_set.activity())

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from torch_geometric.data import HeteroData
 
+from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.solver_targets import SolverTargets
 from gpe_pl.data.statistics import FRAMES_AT_ONCE
@@ -26,10 +27,9 @@ from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.rollout.loop import Restartable
 from gpe_pl.trajectory import integrators
-from gpe_pl.trajectory.reflection import Reflection
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import StoreError, UnsoundError, open_field, open_group, open_shard, read_trajectory, shards, trajectory_names
-from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
@@ -72,9 +72,6 @@ CACHE_BYTES = 2 * 1024**3
 """A split is cached in memory if its compressed files have at most half this size [bytes]. Larger splits are read from disk window by window. Cached graphs may
 take this much memory, too."""
 
-
-MIRROR_STREAM = 1
-"""Further component of the seed for mirroring, which makes mirroring independent of the noise."""
 
 MAX_DAMAGED = 0.2
 """Maximum fraction of a split's trajectories that may be left out. One trajectory may always be left out."""
@@ -301,9 +298,9 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         builder: builder of the graphs.
         noise: noise on inputs; None for evaluation.
         velocity_unit: root mean square acceleration × frame interval [m/s], the unit of velocity noise.
-        seed: seed of noise and mirroring.
+        seed: seed of noise and augmentation.
         solver: gives the targets of noisy and unrolled states; None takes those that lead back to the trajectory.
-        mirror: mirror each window at random. Every axis without gravity is mirrored with probability 1/2, independently of the others.
+        augmentation: images of windows; those beyond mirror images do not go together with ``solver``.
         stress: also give the Cauchy stress at t+1 of materials that have one, as ``stress_target`` [node, component] in Pa.
         unroll_steps: number of steps of an unroll with gradients. Each window then has at least that many true frames after t.
 
@@ -312,6 +309,7 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             divided by this one.
 
     Raises:
+        AugmentationError: the scenes do not have a symmetry of ``augmentation``.
         StoreError: no trajectory is long enough. Reading a window raises it if the trajectory cannot be read, or has invalid values.
     """
 
@@ -324,11 +322,12 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         seed: int = 0,
         stress: bool = False,
         solver: Restartable | None = None,
-        mirror: bool = False,
+        augmentation: Augmentation = Augmentation(),  # noqa: B008
         unroll_steps: int = 1,
     ) -> None:
         self.trajectories, self.builder, self.noise, self.stress, self.solver = trajectories, builder, noise, stress, solver
-        self.mirror, self.unroll_steps = mirror, unroll_steps
+        self.augmentation, self.unroll_steps = augmentation, unroll_steps
+        augmentation.check(builder.metadata)
         self.velocity_unit, self.seed = velocity_unit, seed
         self.probability: np.ndarray | None = None
         self.ends = np.cumsum(window_counts(trajectories, builder.config.history, unroll_steps))
@@ -358,12 +357,6 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             values.append(np.sqrt(np.mean(acc**2, axis=(1, 2)))[self.builder.config.history - 1 :])
         return np.concatenate(values)
 
-    def _reflection(self, metadata: Metadata, sample: int) -> Reflection:
-        if not self.mirror:
-            return Reflection.of(metadata.bounds, ())
-        rng = np.random.default_rng((self.seed, sample, MIRROR_STREAM))
-        return Reflection.of(metadata.bounds, [axis for axis, pull in enumerate(metadata.gravity) if pull == 0 and rng.random() < 0.5])
-
     @overload
     def __getitem__(self, key: int | tuple[int, int]) -> HeteroData: ...
 
@@ -386,8 +379,8 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         stored = self.trajectories[number]
         ahead = self.unroll_steps - 1 if is_unroll else 0 if start is None else min(start.num_steps, stored.num_frames - 2 - frame)
         original = stored.window(frame - history, frame + 2 + ahead)
-        reflection = self._reflection(original.metadata, sample)
-        trajectory = reflection.trajectory(original)
+        reflection = self.augmentation.reflection(original.metadata, self.seed, sample)
+        trajectory = self.augmentation.moved(reflection.trajectory(original), history, self.seed, sample)
         dt = trajectory.metadata.frame_dt
         truth = trajectory.pos.astype(np.float64)
         pos = truth[: history + 2]

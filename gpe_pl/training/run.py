@@ -20,6 +20,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
+from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import PushForward, Sampling
@@ -59,7 +60,7 @@ class TrainingSettings:
         push_fraction: fraction of the steps, at the end of training, that use push-forward.
         push_steps: maximum number of steps of an unroll.
         push_correction: fraction of the velocity's deviation after an unroll that the target removes within one step, with ``targets=trajectory``.
-        mirror: mirror training windows at random along axes without gravity; see ``WindowDataset``.
+        mirror, rotate, boost_speed: images of training windows, see ``data.augmentation``.
         targets: targets of noisy and unrolled states, see ``Targets`` and ``data.solver_targets``.
         early_layers: train only the weights that ``start_from`` did not give, the embeddings of materials, the encoders, and this number of the first
             message-passing steps; None trains all weights.
@@ -80,6 +81,8 @@ class TrainingSettings:
     noise_correction: Annotated[float, Field(ge=0, le=1)] = 0.0
     targets: Targets = "trajectory"
     mirror: bool = False
+    rotate: bool = False
+    boost_speed: Annotated[float, Field(ge=0, le=100)] = 0.0
     sampling: Sampling = "uniform"
     push_fraction: Annotated[float, Field(ge=0, le=1)] = 0.0
     push_steps: Annotated[int, Field(ge=1)] = 20
@@ -100,6 +103,8 @@ class TrainingSettings:
             raise ValueError(
                 f"val_interval={self.val_interval} must divide num_steps={self.num_steps}: the last steps would be neither validated nor saved"
             )
+        if self.augmentation.is_beyond_mirror and self.targets != "trajectory":
+            raise ValueError(f"rotate and boost_speed: not together with targets={self.targets}, whose walls stay; set targets=trajectory")
         if (self.unroll_steps or 1) > 1:
             if self.push_fraction:
                 raise ValueError(
@@ -107,6 +112,11 @@ class TrainingSettings:
                 )
             if self.targets != "trajectory":
                 raise ValueError(f"unroll_steps={self.unroll_steps}: not together with targets={self.targets}; set targets=trajectory")
+
+    @property
+    def augmentation(self) -> Augmentation:
+        """Images of training windows."""
+        return Augmentation(self.mirror, self.rotate, self.boost_speed)
 
     @property
     def noise(self) -> Noise:

@@ -1,11 +1,12 @@
-"""Mirror images of scenes. The mirror image of a motion obeys the same laws of physics if gravity is mirrored, too."""
+"""Mirror images and rotations of scenes. The image of a motion obeys the same laws of physics if gravity is mapped, too."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
+import numpy as np
 from array_api_compat import array_namespace, device
 
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
@@ -15,8 +16,65 @@ from gpe_pl.trajectory.trajectory import Trajectory
 Array = Any
 
 
+class Isometry(Protocol):
+    """A map of space that keeps lengths, given by its images of points, vectors and symmetric tensors."""
+
+    def vector(self, x: Array) -> Array:
+        """Return the images of vectors [..., dim]."""
+
+    def point(self, x: Array) -> Array:
+        """Return the images of positions [..., dim] in m."""
+
+    def tensor(self, x: Array) -> Array:
+        """Return the images of stresses [..., component], in the order of ``schema.STRESS_COMPONENTS``."""
+
+    def boundary(self, boundary: Boundary) -> Boundary:
+        """Return the image of a boundary; it has nodes and no shapes."""
+        motion = boundary.motion
+        if motion is not None:
+            motion = BoundaryMotion(self.point(motion.pos), self.vector(motion.vel), self.vector(motion.normal))
+        return replace(
+            boundary,
+            pos=self.point(boundary.pos),
+            vel=self.vector(boundary.vel),
+            normal=self.vector(boundary.normal),
+            shapes=(),
+            motion=motion,
+        )
+
+    def state(self, state: State, boundary: Boundary) -> State:
+        """Return the image of a state, given that of its boundary. ``periodicity`` and ``internal`` stay as they are."""
+        history, rest_pos, stress = state.velocity_history, state.rest_pos, state.stress
+        return replace(
+            state,
+            pos=self.point(state.pos),
+            vel=self.vector(state.vel),
+            velocity_history=None if history is None else self.vector(history),
+            frame_velocity=None if state.frame_velocity is None else self.vector(state.frame_velocity),
+            rest_pos=None if rest_pos is None else self.point(rest_pos),
+            gravity=self.vector(state.gravity),
+            stress=None if stress is None else self._stress(stress),
+            boundary=boundary,
+        )
+
+    def trajectory(self, trajectory: Trajectory) -> Trajectory:
+        """Return the image of a trajectory. Its metadata, with gravity and domain, stay as they are."""
+        rest_pos, stress = trajectory.rest_pos, trajectory.stress
+        return replace(
+            trajectory,
+            pos=self.point(trajectory.pos),
+            vel=self.vector(trajectory.vel),
+            rest_pos=None if rest_pos is None else self.point(rest_pos),
+            stress=None if stress is None else self._stress(stress),
+            boundary=self.boundary(trajectory.boundary),
+        )
+
+    def _stress(self, stress: Stress) -> Stress:
+        return Stress(self.tensor(stress.node), self.tensor(stress.cell))
+
+
 @dataclass(frozen=True)
-class Reflection:
+class Reflection(Isometry):
     """Reflection at planes, each normal to one axis. It is its own inverse.
 
     Attributes:
@@ -50,51 +108,44 @@ class Reflection:
         signs = [-1.0 if turned[i] != turned[j] else 1.0 for i, j in pairs] + [1.0] * (len(turned) == 2)
         return x * _row(signs, x)
 
-    def boundary(self, boundary: Boundary) -> Boundary:
-        """Return the image of a boundary; it has nodes and no shapes."""
-        motion = boundary.motion
-        if motion is not None:
-            motion = BoundaryMotion(self.point(motion.pos), self.vector(motion.vel), self.vector(motion.normal))
-        return replace(
-            boundary,
-            pos=self.point(boundary.pos),
-            vel=self.vector(boundary.vel),
-            normal=self.vector(boundary.normal),
-            shapes=(),
-            motion=motion,
-        )
-
-    def state(self, state: State, boundary: Boundary) -> State:
-        """Return the image of a state, given that of its boundary. ``periodicity`` and ``internal`` stay as they are."""
-        history, rest_pos, stress = state.velocity_history, state.rest_pos, state.stress
-        return replace(
-            state,
-            pos=self.point(state.pos),
-            vel=self.vector(state.vel),
-            velocity_history=None if history is None else self.vector(history),
-            frame_velocity=None if state.frame_velocity is None else self.vector(state.frame_velocity),
-            rest_pos=None if rest_pos is None else self.point(rest_pos),
-            gravity=self.vector(state.gravity),
-            stress=None if stress is None else self._stress(stress),
-            boundary=boundary,
-        )
-
     def trajectory(self, trajectory: Trajectory) -> Trajectory:
         """Return the image of a trajectory; the same object if there are no planes. The planes must map gravity and the domain onto themselves."""
-        if all(plane is None for plane in self.planes):
-            return trajectory
-        rest_pos, stress = trajectory.rest_pos, trajectory.stress
-        return replace(
-            trajectory,
-            pos=self.point(trajectory.pos),
-            vel=self.vector(trajectory.vel),
-            rest_pos=None if rest_pos is None else self.point(rest_pos),
-            stress=None if stress is None else self._stress(stress),
-            boundary=self.boundary(trajectory.boundary),
-        )
+        return trajectory if all(plane is None for plane in self.planes) else super().trajectory(trajectory)
 
-    def _stress(self, stress: Stress) -> Stress:
-        return Stress(self.tensor(stress.node), self.tensor(stress.cell))
+
+@dataclass(frozen=True)
+class Rotation(Isometry):
+    """Rotation of scenes in 3D, with NumPy arrays.
+
+    Attributes:
+        matrix: rotation of vectors [3, 3].
+        centre: point that stays [3] in m.
+    """
+
+    matrix: np.ndarray
+    centre: np.ndarray
+
+    @classmethod
+    def about(cls, axis: int, angle: float, centre: Sequence[float]) -> Rotation:
+        """Return the rotation by an angle [rad] about an axis of coordinates through a point [3] in m."""
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        matrix = np.eye(3)
+        matrix[[first, first, second, second], [first, second, first, second]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
+        return cls(matrix, np.asarray(centre, float))
+
+    def vector(self, x: Array) -> Array:
+        """Return the images of vectors [..., 3]."""
+        return (x @ self.matrix.T).astype(x.dtype)
+
+    def point(self, x: Array) -> Array:
+        """Return the images of positions [..., 3] in m."""
+        return ((x - self.centre) @ self.matrix.T + self.centre).astype(x.dtype)
+
+    def tensor(self, x: Array) -> Array:
+        """Return the images of stresses [..., 6], in the order of ``schema.STRESS_COMPONENTS``."""
+        full = x[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*x.shape[:-1], 3, 3)
+        turned = self.matrix @ full @ self.matrix.T
+        return turned.reshape(*x.shape[:-1], 9)[..., [0, 1, 2, 4, 5, 8]].astype(x.dtype)
 
 
 def _row(values: list[float], like: Any) -> Array:

@@ -51,7 +51,9 @@ def run(state: State, solver: FEM, num_frames: int) -> np.ndarray:
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "scene.inp").write_text(deck(state, solver, num_frames), encoding="ascii")
         try:
-            done = subprocess.run([PROGRAM, "-i", "scene"], cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False)
+            done = subprocess.run(
+                [PROGRAM, "-i", "scene"], cwd=folder, capture_output=True, encoding="utf-8", errors="replace", timeout=SECONDS, check=False
+            )
         except subprocess.TimeoutExpired:
             raise EngineError(f"CalculiX: took longer than {SECONDS} s") from None
         table = Path(folder, "scene.dat")

@@ -2,6 +2,7 @@
 
 - ``calculix``: a block of a solid that falls on a floor.
 - ``splishsplash``: a column of liquid that collapses in a box.
+- ``kratos``: a column of sand that collapses on a rough floor.
 
 Solver and engine start from the same state. The first frames of the model are the solver's, because a model needs a history.
 """
@@ -9,6 +10,7 @@ Solver and engine start from the same state. The first frames of the model are t
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,8 +19,8 @@ import numpy as np
 
 from gpe_pl.benchmarks.acceptance import scenes
 from gpe_pl.benchmarks.acceptance.trial import Candidate, predicted
-from gpe_pl.benchmarks.outside import calculix, splishsplash
-from gpe_pl.benchmarks.outside.experiments import DAM_WIDTH, FRONT, filled
+from gpe_pl.benchmarks.outside import calculix, kratos, splishsplash
+from gpe_pl.benchmarks.outside.experiments import DAM_WIDTH, FRONT, HALF_WIDTH, filled
 from gpe_pl.files.markdown import table_row
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.trajectory.state import State
@@ -28,11 +30,16 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-EngineName = Literal["calculix", "splishsplash"]
+EngineName = Literal["calculix", "splishsplash", "kratos"]
 DROP_GAP, DROP_SPEED, DROP_SECONDS = 0.05, 1.0, 0.2
 """Gap between the block and the floor [m], speed at the start [m/s], and duration [s]."""
 DAM_SECONDS = 0.3
 """Duration of the collapse of a column of liquid [s]. The liquid does not reach the opposite wall."""
+COLUMN_ASPECT, COLUMN_SECONDS = 2, 0.4
+"""Height of the column of sand over its half width, and duration of the collapse [s]."""
+
+COLUMNS = 4
+"""Panels of a figure side by side."""
 
 Quantities = dict[str, Callable[[np.ndarray, Candidate], np.ndarray]]
 """Lengths over time [frame] in m by name, from positions [frame, node, dim]."""
@@ -44,6 +51,10 @@ def _centre(axis: int) -> Callable[[np.ndarray, Candidate], np.ndarray]:
 
 def _front(pos: np.ndarray, candidate: Candidate) -> np.ndarray:
     return np.quantile(pos[..., 0], FRONT, axis=1) + candidate.spacing / 2 - candidate.spec.scene.bounds[0][0]
+
+
+def _run_out(pos: np.ndarray, candidate: Candidate) -> np.ndarray:
+    return np.quantile(np.abs(pos[..., 0] - scenes.middle_of_floor(candidate.spec)[0]), FRONT, axis=1) + candidate.spacing / 2
 
 
 @dataclass(frozen=True)
@@ -99,6 +110,16 @@ def _by_splishsplash(candidate: Candidate, state: State, num_frames: int) -> np.
     return splishsplash.run(state, scene.bounds, scene.spacing, candidate.spec.solver.frame_dt, num_frames)
 
 
+def _column(candidate: Candidate, value: float) -> State:
+    return scenes.column(candidate.spec, value, 2 * HALF_WIDTH, COLUMN_ASPECT * HALF_WIDTH)
+
+
+def _by_kratos(candidate: Candidate, state: State, num_frames: int) -> np.ndarray:
+    scene, solver = candidate.spec.scene, candidate.spec.solver
+    constants: Any = solver
+    return kratos.run(state, constants.constants_of("sand"), scene.bounds, scene.spacing, solver.frame_dt, num_frames)
+
+
 SCENES: dict[str, EngineScene] = {
     "calculix": EngineScene(
         "CalculiX", "apt install calculix-ccx (Debian, Ubuntu), or the program ccx from calculix.de on the path", calculix.is_missing, "solid",
@@ -111,6 +132,13 @@ SCENES: dict[str, EngineScene] = {
         "a column of liquid collapses in a box", _dam, _by_splishsplash, DAM_SECONDS,
         {"front": _front, "height of the centre": _centre(2)}, False,
         "particles interact over two spacings without a grid, and walls are particles; ours has a grid of two spacings",
+    ),
+    "kratos": EngineScene(
+        "Kratos MPM", "pip install KratosMPMApplication", kratos.is_missing, "sand",
+        "a column of sand collapses on a rough floor", _column, _by_kratos, COLUMN_SECONDS,
+        {"half width": _run_out, "height of the centre": _centre(1)}, True,
+        "Mohr–Coulomb plasticity without dilatancy, implicit steps and a bilinear grid of two spacings; ours has Drucker–Prager plasticity, explicit steps and "
+        "a quadratic grid of one spacing",
     ),
 }  # fmt: skip
 """Scenes by the names of their engines."""
@@ -185,19 +213,24 @@ def report(records: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def drawn(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
-    """Draw one figure per engine: engine, solver and model over time, one panel per quantity and parameter."""
+    """Draw one figure: engine, solver and model over time, one panel per quantity and parameter. Nothing is drawn without engines."""
     from gpe_pl.viz.film_strip import new_figure
 
-    found = {}
-    for name in dict.fromkeys(record["engine_name"] for record in records if "quantity" in record):
-        own = [r for r in records if r.get("engine_name") == name and max(r["engine"]) > 0]
-        figure = new_figure(3.4 * len(own), 3.0)
-        figure.set_layout_engine("constrained")
-        for axes, r in zip(np.ravel(figure.subplots(1, len(own))), own, strict=True):
-            for key, style in (("engine", ":"), ("solver", "-"), ("model", "--")):
-                axes.plot(r["x"][: len(r[key])], r[key], style, label=SCENES[name].label if key == "engine" else key)
-            axes.set_title(r["parameter"], fontsize="small")
-            axes.set(xlabel="t [s]", ylabel=f"{r['quantity']} [m]")
-            axes.legend(fontsize="small")
-        found[f"engine_{name}"] = figure
-    return found
+    panels = [r for r in records if "quantity" in r and max(r["engine"]) > 0]
+    if not panels:
+        return {}
+    rows = math.ceil(len(panels) / COLUMNS)
+    figure = new_figure(2.3 * COLUMNS, 2.1 * rows)
+    figure.set_layout_engine("constrained")
+    grid = np.ravel(figure.subplots(rows, COLUMNS, squeeze=False))
+    for axes, r in zip(grid, panels, strict=False):
+        label = SCENES[r["engine_name"]].label
+        for key, style in (("engine", ":"), ("solver", "-"), ("model", "--")):
+            axes.plot(r["x"][: len(r[key])], r[key], style, label=label if key == "engine" else key)
+        axes.set_title(f"{r['parameter']}\n{r['quantity']} [m]", fontsize="x-small")
+        axes.tick_params(labelsize="x-small")
+        axes.set_xlabel("t [s]", fontsize="x-small")
+        axes.legend(fontsize="x-small")
+    for axes in grid[len(panels) :]:
+        axes.set_visible(False)
+    return {"engines": figure}

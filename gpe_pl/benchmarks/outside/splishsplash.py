@@ -66,7 +66,7 @@ def run(state: State, bounds: tuple[tuple[float, float], ...], spacing: float, f
         np.save(folder / "vel.npy", state.vel)
         command = [sys.executable, "-m", __name__, name, str(num_frames)]
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
+            done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", timeout=SECONDS, check=False)
         except subprocess.TimeoutExpired:
             raise EngineError(f"SPlisHSPlasH: took longer than {SECONDS} s") from None
         if not (folder / "frames.npy").is_file():

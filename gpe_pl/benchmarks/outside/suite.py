@@ -49,7 +49,7 @@ class Settings:
     folder: str = "outside"
     checkpoints: Annotated[list[str], Field(min_length=1)] = field(default_factory=lambda: ["fluid", "sand", "fem"])
     experiments: list[Experiment] = field(default_factory=lambda: ["dam_break", "column_collapse", "droplet"])
-    engines: list[EngineName] = field(default_factory=lambda: ["calculix", "splishsplash"])
+    engines: list[EngineName] = field(default_factory=lambda: ["calculix", "splishsplash", "kratos"])
     num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
 
 
@@ -110,5 +110,5 @@ def report(records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, st
 
 
 def figures(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
-    """Draw one figure per experiment and model, and one per engine."""
+    """Draw one figure per experiment and model, and one of all engines."""
     return experiments.drawn(records) | engines.drawn(records)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import subprocess
 import sys
 from pathlib import Path
 
@@ -11,11 +12,12 @@ import numpy as np
 import pytest
 
 from gpe_pl.benchmarks.acceptance.scenes import block
-from gpe_pl.benchmarks.outside import calculix, engines, splishsplash
+from gpe_pl.benchmarks.outside import calculix, engines, kratos, splishsplash
 from gpe_pl.benchmarks.outside.engine import EngineError
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.fem import FEM
+from gpe_pl.solvers.materials import Sand
 from gpe_pl.solvers.solid_scenes import lumped_masses
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
@@ -40,6 +42,14 @@ def cube_of_liquid(viscosity: float) -> State:
     return State(
         pos, np.zeros_like(pos), np.full(len(pos), node_code("fluid"), np.uint8), np.full(len(pos), 1000 * SPACING**3),
         np.full((len(pos), 1), viscosity), Boundary.empty(3), np.array([0.0, 0.0, -9.81]),
+    )  # fmt: skip
+
+
+def column_of_sand(friction_angle: float) -> State:
+    pos = np.array([0.4, 0.0]) + SPACING * (np.stack(np.meshgrid(np.arange(4), np.arange(6), indexing="ij"), -1).reshape(-1, 2) + 0.5)
+    return State(
+        pos, np.zeros_like(pos), np.full(len(pos), node_code("sand"), np.uint8), np.full(len(pos), 1600 * SPACING**2),
+        np.full((len(pos), 1), friction_angle), Boundary.empty(2), np.array([0.0, -9.81]),
     )  # fmt: skip
 
 
@@ -76,6 +86,27 @@ def test_points_are_big_endian_with_a_weight() -> None:
     np.testing.assert_array_equal(np.frombuffer(data[41:73], ">f4").reshape(2, 4), [[1, 2, 3, 1], [4, 5, 6, 1]])
 
 
+def test_a_particle_is_a_square_around_it_and_walls_are_the_rim_of_the_grid() -> None:
+    body = kratos._body(np.array([[0.3, 0.4], [0.5, 0.4]]), 0.1).splitlines()
+    corners = np.array([[float(x) for x in line.split()[1:3]] for line in body[body.index("Begin Nodes") + 1 : body.index("End Nodes")]])
+    np.testing.assert_allclose(corners.reshape(2, 4, 2).mean(axis=1), [[0.3, 0.4], [0.5, 0.4]])
+    (ax, ay), (bx, by) = (corners[1] - corners[0]), (corners[2] - corners[1])
+    assert ax * by - ay * bx > 0  # the corners run counterclockwise
+    grid = kratos._grid(((0.0, 1.0), (0.0, 0.5)), 0.25)
+    walls = grid[grid.index("Begin SubModelPart Walls") :].split("Begin SubModelPartNodes\n")[1].split("End")[0].split()
+    assert len(walls) == 12 and grid.count("\n") > 15  # all nodes of 5 × 3 but the 3 inside
+
+
+def test_particles_that_an_engine_lost_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fewer(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        np.save(Path(command[3]) / "frames.npy", np.zeros((3, 5, 2)))
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(subprocess, "run", fewer)
+    with pytest.raises(EngineError, match=r"has frames and nodes \(3, 5\), expected \(3, 24\)"):
+        kratos.run(column_of_sand(30.0), Sand(), UNIT_SQUARE, SPACING, 5e-3, 3)
+
+
 def record(model: list[float]) -> dict[str, object]:
     about = {"engine_name": "calculix", "model": "m", "parameter": "E", "spacing": 0.5, "quantity": "height", "x": [0.0, 1.0]}
     return about | {"engine": [1.0, 2.0], "solver": [1.5, 2.5], "model": model}
@@ -87,7 +118,7 @@ def test_differences_are_means_in_spacings_until_a_model_stopped() -> None:
     assert whole == "| CalculiX | E | height | 2.0 | 1.00 | 1.00 | 1.00 |"
     assert "2.00 until it stopped" in "".join(engines.report([record([2.0])]))
     assert engines.report([{"missing": "x"}]) == []
-    assert engines.drawn([record([2.0])]).keys() == {"engine_calculix"}
+    assert engines.drawn([record([2.0])]).keys() == {"engines"} and engines.drawn([]) == {}
 
 
 @pytest.mark.slow
@@ -113,3 +144,13 @@ def test_splishsplash_spreads_a_thin_liquid_further_than_a_thick_one() -> None:
     assert thin.shape == thick.shape == (30, 64, 3)
     assert thin[-1, :, 0].max() > 1.2 * thick[-1, :, 0].max()
     assert (thin > -0.1 * SPACING).all() and (thin < 1 + 0.1 * SPACING).all()
+
+
+@pytest.mark.slow
+def test_kratos_lets_a_column_of_sand_collapse_further_with_less_friction() -> None:
+    if kratos.is_missing():
+        pytest.skip("KratosMPMApplication is not installed")
+    loose, firm = (kratos.run(column_of_sand(angle), Sand(), UNIT_SQUARE, SPACING, 5e-3, 50) for angle in (15.0, 40.0))
+    np.testing.assert_allclose(loose[0], column_of_sand(0.0).pos, atol=1e-6)
+    widths = [np.ptp(pos[-1, :, 0]) for pos in (loose, firm)]
+    assert widths[0] > 1.1 * widths[1] > 1.1 * 4 * SPACING * 0.9

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from gpe_pl.config.datasets import dataset
+from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.dataset import StartKey, StoredTrajectory, WindowDataset
 from gpe_pl.data.ground_truth import generate_trajectory
 from gpe_pl.data.noise import Noise
@@ -41,7 +42,9 @@ def fem() -> tuple[Restartable, Trajectory]:
 def windows(solver: Restartable | None, truth: Trajectory, noise: Noise | None = None, mirror: bool = False) -> WindowDataset:
     stored = StoredTrajectory(Path("shard"), "0", truth.num_frames, truth.num_nodes, truth)
     builder = GraphBuilder(GraphConfig(history=HISTORY, mesh=True), truth.metadata)
-    return WindowDataset([stored], builder, noise, 0.05, seed=3, stress=truth.stress is not None, solver=solver, mirror=mirror)
+    return WindowDataset(
+        [stored], builder, noise, 0.05, seed=3, stress=truth.stress is not None, solver=solver, augmentation=Augmentation(mirror)
+    )
 
 
 def start_of(solver: Restartable | None, truth: Trajectory, num_steps: int = 3) -> tuple[WindowDataset, UnrollStart]:

@@ -1,0 +1,97 @@
+"""Augmentation of training windows by symmetries of mechanics: mirror images, rotations about gravity, and frames of reference that move.
+
+All of them are exact: the image of a window, with its walls, is a window that the same solver could have made. Each sample draws its own image.
+
+- A mirror image maps the domain onto itself.
+- A rotation turns walls along with the scene, so the walls of its image are oblique.
+- A frame of reference that moves (Galilean shift) adds one velocity to everything. Walls that were at rest then move, because friction and contact depend on
+  velocities relative to walls. Without moving walls the image would be wrong wherever a wall is near.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gpe_pl.errors import GpeError
+from gpe_pl.trajectory.boundary import BoundaryMotion
+from gpe_pl.trajectory.reflection import Reflection, Rotation
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+
+MIRROR_STREAM, TURN_STREAM, BOOST_STREAM = 1, 2, 3
+"""Further components of the seed, which make the draws independent of the noise and of each other."""
+
+
+class AugmentationError(GpeError, ValueError):
+    """Raised when the scenes do not have a symmetry; the message names the setting."""
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Images of training windows.
+
+    Attributes:
+        mirror: mirror each window at random. Every axis without gravity is mirrored with probability 1/2, independently of the others.
+        rotate: turn each window about the vertical by a random angle; in 3D.
+        boost_speed: speed [m/s] up to which a random velocity, along each axis without gravity, is added to the scene and its walls.
+    """
+
+    mirror: bool = False
+    rotate: bool = False
+    boost_speed: float = 0.0
+
+    @property
+    def is_beyond_mirror(self) -> bool:
+        """Whether images differ by more than a reflection."""
+        return self.rotate or self.boost_speed > 0
+
+    def check(self, metadata: Metadata) -> None:
+        """Check that scenes have the symmetries.
+
+        Raises:
+            AugmentationError: windows are to be turned in 2D, without one axis of gravity, or in a periodic domain, or moved in a periodic domain.
+        """
+        if self.rotate and (metadata.dim != 3 or np.count_nonzero(metadata.gravity) > 1):
+            raise AugmentationError(
+                "training.rotate=true: needs scenes in 3D with gravity along one axis or none; choose training.mirror=true"
+            )
+        if self.is_beyond_mirror and any(metadata.periodic):
+            raise AugmentationError(
+                "training.rotate and training.boost_speed: not in periodic domains, which stay as they are; leave them off"
+            )
+
+    def reflection(self, metadata: Metadata, seed: int, sample: int) -> Reflection:
+        """Return the reflection of a sample."""
+        if not self.mirror:
+            return Reflection.of(metadata.bounds, ())
+        rng = np.random.default_rng((seed, sample, MIRROR_STREAM))
+        return Reflection.of(metadata.bounds, [axis for axis, pull in enumerate(metadata.gravity) if pull == 0 and rng.random() < 0.5])
+
+    def moved(self, trajectory: Trajectory, frame: int, seed: int, sample: int) -> Trajectory:
+        """Return a window turned and seen from a moving frame of reference. At ``frame`` this frame coincides with the one at rest."""
+        metadata = trajectory.metadata
+        if self.rotate:
+            (axis,) = np.flatnonzero(metadata.gravity) if np.any(metadata.gravity) else (2,)
+            angle = np.random.default_rng((seed, sample, TURN_STREAM)).uniform(0, 2 * np.pi)
+            trajectory = Rotation.about(int(axis), angle, [(low + high) / 2 for low, high in metadata.bounds]).trajectory(trajectory)
+        if self.boost_speed > 0:
+            velocity = np.random.default_rng((seed, sample, BOOST_STREAM)).uniform(-self.boost_speed, self.boost_speed, metadata.dim)
+            velocity[np.asarray(metadata.gravity) != 0] = 0.0
+            trajectory = boosted(trajectory, velocity, frame)
+        return trajectory
+
+
+def boosted(trajectory: Trajectory, velocity: np.ndarray, frame: int) -> Trajectory:
+    """Return a trajectory to which a velocity [dim] in m/s is added, with its walls. At ``frame`` all positions are the same."""
+    boundary, num_frames = trajectory.boundary, trajectory.num_frames
+    way = (np.arange(num_frames) - frame)[:, None, None] * trajectory.metadata.frame_dt * velocity
+    still = BoundaryMotion(*(np.broadcast_to(x, (num_frames, *x.shape)) for x in (boundary.pos, boundary.vel, boundary.normal)))
+    motion = boundary.motion or still
+    motion = BoundaryMotion((motion.pos + way).astype(motion.pos.dtype), (motion.vel + velocity).astype(motion.vel.dtype), motion.normal)
+    return replace(
+        trajectory,
+        pos=(trajectory.pos + way).astype(trajectory.pos.dtype),
+        vel=(trajectory.vel + velocity).astype(trajectory.vel.dtype),
+        boundary=replace(boundary, pos=motion.pos[0], vel=motion.vel[0], shapes=(), motion=motion),
+    )

@@ -1,0 +1,106 @@
+"""Images of training windows obey the same mechanics: turned and moved scenes have turned and equal accelerations, and their walls go along."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gpe_pl.data.augmentation import Augmentation, AugmentationError, boosted
+from gpe_pl.data.dataset import StartKey, StoredTrajectory, WindowDataset
+from gpe_pl.geometry.shapes import domain_walls
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.training.run import TrainingSettings
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.reflection import Rotation
+from gpe_pl.trajectory.trajectory import Trajectory
+
+DT, HISTORY = 0.01, 2
+
+
+@pytest.fixture(scope="module")
+def truth() -> Trajectory:
+    """A drop that falls beside a wall and turns."""
+    rng = np.random.default_rng(0)
+    times = DT * np.arange(9)[:, None, None]
+    start, vel, acc = rng.uniform(0.05, 0.25, (12, 3)), rng.uniform(-1, 1, (12, 3)), rng.uniform(-5, 5, (12, 3))
+    bounds = ((0.0, 1.0), (0.0, 0.8), (0.0, 0.6))
+    return Trajectory.from_numpy(
+        start + times * vel + times**2 * acc / 2, DT, "fluid", {"fluid": 0.01}, bounds=bounds, gravity=(0.0, 0.0, -9.81), spacing=0.1,
+        boundary=Boundary.sample(domain_walls(bounds, 0.3), 0.1, 3),
+    )  # fmt: skip
+
+
+def windows(truth: Trajectory, augmentation: Augmentation) -> WindowDataset:
+    stored = StoredTrajectory(Path("shard"), "0", truth.num_frames, truth.num_nodes, truth)
+    return WindowDataset([stored], GraphBuilder(GraphConfig(history=HISTORY), truth.metadata), seed=3, augmentation=augmentation)
+
+
+def test_a_turned_window_has_the_turned_target_and_walls(truth: Trajectory) -> None:
+    plain, turned = (windows(truth, a)[StartKey(7, 1, 2)] for a in (Augmentation(), Augmentation(rotate=True)))
+    centre = torch.tensor([0.5, 0.4, 0.3])
+    before, after = plain.truth - centre, turned.truth - centre
+    torch.testing.assert_close(after[..., 2], before[..., 2], rtol=0, atol=1e-7)
+    torch.testing.assert_close(after[..., :2].norm(dim=-1), before[..., :2].norm(dim=-1), rtol=0, atol=1e-6)
+    assert (after - before).abs().max() > 0.05
+    angle = torch.atan2(after[0, 0, 1], after[0, 0, 0]) - torch.atan2(before[0, 0, 1], before[0, 0, 0])
+    turn = torch.eye(3, dtype=torch.float64)
+    turn[:2, :2] = torch.tensor([[angle.cos(), -angle.sin()], [angle.sin(), angle.cos()]])
+    torch.testing.assert_close(
+        turned.target(turned.state, 0, DT)[0], plain.target(plain.state, 0, DT)[0] @ turn.T, rtol=0, atol=2e-2
+    )  # stored in float32
+    torch.testing.assert_close(
+        turned.state.boundary.normal, plain.state.boundary.normal @ turn.T.to(plain.state.boundary.normal), rtol=0, atol=1e-6
+    )
+    other = windows(truth, Augmentation(rotate=True))[StartKey(6, 1, 2)]
+    assert (other.truth - turned.truth).abs().max() > 0.01
+
+
+def test_a_moving_frame_changes_velocities_and_not_accelerations(truth: Trajectory) -> None:
+    plain, moved = (windows(truth, a)[StartKey(5, 1, 3)] for a in (Augmentation(), Augmentation(boost_speed=2.0)))
+    velocity = (moved.state.vel - plain.state.vel)[0]
+    assert velocity[2] == 0 and 0.1 < velocity.abs().max() < 2
+    torch.testing.assert_close(moved.state.pos, plain.state.pos)
+    torch.testing.assert_close(moved.target(moved.state, 0, DT)[0], plain.target(plain.state, 0, DT)[0], rtol=0, atol=2e-2)
+    torch.testing.assert_close(
+        moved.state.boundary.vel, velocity.to(moved.state.boundary.vel).expand(moved.state.boundary.vel.shape), rtol=0, atol=1e-6
+    )
+    later = moved.state.later(DT, moved.state.pos, moved.state.vel)
+    torch.testing.assert_close(later.boundary.pos.double(), moved.state.boundary.pos.double() + DT * velocity, rtol=0, atol=1e-6)
+    graphs = [windows(truth, a)[0] for a in (Augmentation(), Augmentation(boost_speed=2.0))]
+    edges = [graph["boundary", "radius", "fluid"] for graph in graphs]
+    assert edges[0].edge_index.shape[1] > 0
+    torch.testing.assert_close(edges[1].odd, edges[0].odd, rtol=0, atol=1e-4)  # distances and velocities relative to walls
+
+
+def test_a_wall_that_moves_already_gets_the_velocity_in_addition(truth: Trajectory) -> None:
+    once = boosted(truth, np.array([0.3, 0.0, 0.0]), 4)
+    twice = boosted(once, np.array([-0.3, 0.5, 0.0]), 4)
+    assert twice.boundary.motion is not None
+    np.testing.assert_allclose(twice.boundary.motion.vel, np.broadcast_to([0.0, 0.5, 0.0], twice.boundary.motion.vel.shape), atol=1e-7)
+    np.testing.assert_allclose(twice.boundary.motion.pos[4], truth.boundary.pos, atol=1e-6)
+
+
+def test_stresses_turn_with_the_planes_they_act_on() -> None:
+    rng = np.random.default_rng(1)
+    stress, normal = rng.normal(size=6), rng.normal(size=3)
+
+    def traction(s: np.ndarray, n: np.ndarray) -> np.ndarray:
+        return np.array([[s[0], s[1], s[2]], [s[1], s[3], s[4]], [s[2], s[4], s[5]]]) @ n
+
+    turn = Rotation.about(1, 0.7, (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(traction(turn.tensor(stress), turn.vector(normal)), turn.vector(traction(stress, normal)), atol=1e-12)
+
+
+def test_scenes_without_the_symmetry_are_refused(truth: Trajectory) -> None:
+    with pytest.raises(AugmentationError, match=r"training.rotate=true: needs scenes in 3D"):
+        Augmentation(rotate=True).check(replace(truth.metadata, gravity=(1.0, 0.0, -9.0)))
+    with pytest.raises(AugmentationError, match=r"not in periodic domains"):
+        Augmentation(boost_speed=1.0).check(replace(truth.metadata, periodic=(True, False, False)))
+    Augmentation(mirror=True).check(replace(truth.metadata, periodic=(True, False, False)))
+    with pytest.raises(ValueError, match=r"not together with targets=solver"):
+        TrainingSettings(num_steps=10, val_interval=10, rotate=True, targets="solver")
