@@ -14,6 +14,7 @@ here because ``gpe_pl.rollout`` is a package.
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -51,6 +52,10 @@ if TYPE_CHECKING:
 
 early_interrupts.begin()
 prepare()  # before Numba and Matplotlib are imported
+if "IPython" in sys.modules and (_shell := sys.modules["IPython"].get_ipython()) is not None:  # a notebook shows trajectories as viewers
+    _shell.display_formatter.formatters["text/html"].for_type_by_name(
+        "gpe_pl.trajectory.trajectory", "Trajectory", lambda trajectory: import_module("gpe_pl.viz.notebook").embedded_viewer(trajectory)
+    )
 
 _MODULES = {
     "Boundary": "trajectory.boundary",

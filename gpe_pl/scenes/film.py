@@ -15,12 +15,11 @@ from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.browser import open_page
 from gpe_pl.viz.captions import describe, heading, with_heading
 from gpe_pl.viz.figures import rollout_figure
+from gpe_pl.viz.notebook import MOST_FRAMES, embedded_viewer
 from gpe_pl.viz.saving import save_figure
 from gpe_pl.viz.video import write_animation
 from gpe_pl.viz.viewer import write_viewer
 
-MOST_FRAMES = 200
-"""Largest number of frames in a viewer or animation. Of longer rollouts, every second, third, … frame is shown."""
 FIGURES = (".png", ".svg", ".pdf")
 ANIMATIONS = (".gif", ".mp4")
 
@@ -80,6 +79,10 @@ class Film:
         else:
             write_npz(path, [self.first, *self.others.values()][-1])
         return path
+
+    def _repr_html_(self) -> str:
+        """Return the viewer for a notebook."""
+        return embedded_viewer(self.first, self.others, self.title)
 
     def show(self) -> Path:
         """Open the viewer in a browser, and return its file. Where there is no browser, print where the file is."""

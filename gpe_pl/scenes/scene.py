@@ -204,6 +204,17 @@ class Scene:
         """Roll a model and its solver out from the same nodes; arguments as in ``predict``."""
         return self._film(model, seconds, with_model=True, with_solver=True)
 
+    def sliders(self, model: str | None = None, seconds: float | int = 1.0) -> Any:
+        """Return a widget for notebooks: a slider for each material parameter, and the viewer of the model's prediction; arguments as in ``predict``.
+
+        Raises:
+            NotebookError: ipywidgets is not installed.
+            SceneFault: the scene is impossible, or does not fit the model.
+        """
+        from gpe_pl.scenes.sliders import sliders
+
+        return sliders(self, model or self._shipped(), seconds)
+
     def show(self) -> Path:
         """Draw the scene to a file, and return its path. Parts with a fault are red."""
         from gpe_pl.scenes.picture import draw

@@ -89,6 +89,15 @@ def write_viewer(
     path = Path(path)
     if path.suffix != ".html":
         raise ValueError(f"{path}: a viewer ends in .html")
+    page, rounding = viewer_page(ground_truth, predictions, stride, title)
+    replace_text(path, page)
+    return rounding
+
+
+def viewer_page(
+    ground_truth: Trajectory, predictions: Mapping[str, Trajectory] | None = None, stride: int = 1, title: str | None = None
+) -> tuple[str, float]:
+    """Return the page that ``write_viewer`` writes, as HTML, and the largest rounding of a shown position [m]; arguments and errors as there."""
     if stride < 1:
         raise ValueError(f"stride must be positive, got {stride}")
     trajectories = with_heading(ground_truth, predictions or {})
@@ -111,8 +120,7 @@ def write_viewer(
         "script": "\n".join((PAGE / name).read_text(encoding="utf-8") for name in ("data.js", "render.js", "viewer.js")),
     }
     page = re.sub(r"\{\{(\w+)\}\}", lambda slot: parts[slot[1]], (PAGE / "viewer.html").read_text(encoding="utf-8"))
-    replace_text(path, page)
-    return float(scene["rounding"])
+    return page, float(scene["rounding"])
 
 
 Arrays = dict[str, tuple[str, np.ndarray]]
