@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import netrc
 import os
@@ -62,8 +61,12 @@ class LoggerSettings:
             mode = self.mode or os.environ.get("WANDB_MODE") or ("online" if has_key() else "offline")
             loggers.append(self._wandb(run_dir, name, config, mode))
         if self.kind == "tensorboard":
-            if importlib.util.find_spec("tensorboard") is None:
-                raise TrackingError("logger=tensorboard: needs tensorboard: `pip install 'gpe_pl[tensorboard]'`, or choose logger=csv")
+            try:
+                import tensorboard  # noqa: F401
+            except ImportError:
+                raise TrackingError(
+                    "logger=tensorboard: needs tensorboard: `pip install 'gpe_pl[tensorboard]'`, or choose logger=csv"
+                ) from None
             loggers.append(TensorBoardLogger(run_dir, name="", version=TENSORBOARD))
         return loggers
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import errno
-import importlib.util
 import logging
+import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -126,7 +126,7 @@ def test_tensorboard_has_losses_of_every_start_and_results_with_figures(tmp_path
 
 
 def test_a_missing_tensorboard_is_said_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
     with pytest.raises(TrackingError, match=r"pip install 'gpe_pl\[tensorboard\]'"):
         LoggerSettings("tensorboard").loggers(tmp_path, "run", {})
 
