@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.export.play_model import PageError
-from gpe_pl.export.program import refuse_rigid_bodies
+from gpe_pl.export.program import refuse_openings, refuse_rigid_bodies
 from gpe_pl.geometry.shapes import Shape
 from gpe_pl.trajectory.boundary import as_numpy
 from gpe_pl.trajectory.state import State
@@ -38,8 +38,10 @@ def state_for_page(state: State, columns: list[int]) -> dict[str, Any]:
     Raises:
         PageError: the page does not know a wall or obstacle.
         RigidBodyError: the state has rigid bodies.
+        OpenSceneError: the state has inlets or outlets.
     """
     refuse_rigid_bodies(state.rigid_body)
+    refuse_openings(state)
     history = state.vel[:, None] if state.velocity_history is None else state.velocity_history
     return {
         "count": state.num_nodes,

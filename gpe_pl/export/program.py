@@ -227,13 +227,27 @@ def refuse_rigid_bodies(rigid_body: Any) -> None:
         )
 
 
+class OpenSceneError(GpeError, ValueError):
+    """Raised for scenes with inlets or outlets, which exported programs and pages do not have."""
+
+
+def refuse_openings(state: State) -> None:
+    """Raise ``OpenSceneError`` if a state has inlets or outlets."""
+    if state.openings:
+        raise OpenSceneError(
+            f"exported programs and pages have no inlets and outlets, and this scene has {len(state.openings)}; roll it out with this package"
+        )
+
+
 def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
     """Return the tensors that a program of this simulator takes, for a state with velocity history.
 
     Raises:
         RigidBodyError: the state has rigid bodies.
+        OpenSceneError: the state has inlets or outlets.
     """
     refuse_rigid_bodies(state.rigid_body)
+    refuse_openings(state)
     builder, spec = simulator.builder, simulator.builder.spec
     topology = replace(builder, config=replace(builder.config, trim_boundary=False)).topology(state)
     mesh, islands = topology.mesh, topology.islands

@@ -61,6 +61,8 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     have ``displacement`` from rest [m], ``error`` (distance from the ground truth [m]), ``stress`` [Pa] and ``von_mises`` [Pa]. Cells have the last two as
     well, NaN on particles. Moving boundary nodes are points like others; ``boundary.vtu`` has the rest, with ``normal``, ``friction`` and ``restitution``.
 
+    In an open scene, each file has the nodes that are in the scene in its frame, with their numbers as ``node``.
+
     In a periodic domain, connected nodes of a mesh are written as images that lie beside each other. Cells then stay whole at the seam, unless the mesh reaches
     around the domain. ``displacement`` follows the path of the nodes across seams.
 
@@ -71,7 +73,8 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
         stride: step between written frames.
 
     Raises:
-        ValueError: the file type is wrong, the stride is not positive, the ground truth has other nodes or fewer frames, or a cell has no known kind.
+        ValueError: the file type is wrong, the stride is not positive, the ground truth has other nodes or fewer frames, a cell has no known kind, or an open
+            scene has a mesh.
         FullDiskError: the disk is full; the written part of a new series is removed.
     """
     path = Path(path)
@@ -83,6 +86,8 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
         raise ValueError(
             f"{path}: the ground truth has {ground_truth.pos.shape[:2]} frames and nodes, the trajectory {trajectory.pos.shape[:2]}"
         )
+    if trajectory.alive is not None and trajectory.cells is not None:
+        raise ValueError(f"{path}: meshes of open scenes are not written; write a NumPy archive")
     trajectory = trajectory.with_moving_boundary()
     ground_truth = None if ground_truth is None else ground_truth.with_moving_boundary()
     folder = path.with_suffix("")
@@ -98,7 +103,10 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
             if moved is not None:
                 points["displacement"] = _in_3d(moved[frame])
             pos, _ = unwrapped(trajectory.pos[frame].astype(np.float64), edges, trajectory.metadata.periodicity)
-            replace_text(folder / name, _grid(pos.astype(trajectory.pos.dtype), cells, points, in_cells))
+            pos = pos.astype(trajectory.pos.dtype)
+            if trajectory.alive is not None:
+                pos, cells, points = _living(trajectory, frame, pos, points)
+            replace_text(folder / name, _grid(pos, cells, points, in_cells))
             time = frame * trajectory.metadata.frame_dt
             entries.append(f'<DataSet timestep="{time:.9g}" part="0" file={quoteattr(f"{folder.name}/{name}")}/>')
         boundary = trajectory.boundary
@@ -175,6 +183,15 @@ def _point_data(trajectory: Trajectory, frame: int, ground_truth: Trajectory | N
     if trajectory.stress is not None:
         data |= _stress(trajectory.stress.node[frame])
     return data
+
+
+def _living(
+    trajectory: Trajectory, frame: int, pos: np.ndarray, points: dict[str, np.ndarray]
+) -> tuple[np.ndarray, _Cells, dict[str, np.ndarray]]:
+    """Return positions, cells and data of the nodes that are in an open scene in a frame; ``node`` are their numbers."""
+    assert trajectory.alive is not None
+    there = np.flatnonzero(trajectory.alive[frame])
+    return pos[there], _vertices(np.arange(len(there))), {"node": there, **{name: values[there] for name, values in points.items()}}
 
 
 def _cell_data(trajectory: Trajectory, frame: int, num_particles: int) -> dict[str, np.ndarray]:

@@ -22,7 +22,7 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics import Metric
 
-from gpe_pl.metrics import bodies, liquids, rigid
+from gpe_pl.metrics import bodies, liquids, open_scenes, rigid
 from gpe_pl.metrics.bodies import Bodies, body_metrics
 from gpe_pl.metrics.liquids import liquid_metrics, liquid_nodes
 from gpe_pl.metrics.mirror import mirror_error, mirrors
@@ -53,6 +53,7 @@ UNITS: dict[str, str] = {
     **bodies.UNITS,
     **rigid.UNITS,
     **liquids.UNITS,
+    **open_scenes.UNITS,
 }
 """Metrics of ``rollout_metrics`` and their units."""
 
@@ -86,7 +87,7 @@ def displacement(
 
 
 def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.ndarray, "frame"]:
-    """Return the mean squared position error of every frame [m²], over nodes and dimensions.
+    """Return the mean squared position error of every frame [m²], over nodes and dimensions. In open scenes, nodes count that are in both at the frame.
 
     Returns:
         One value per frame, including frame 0 (zero up to rounding). If the rollout stopped early, the array has the length of the ground truth, with ``inf``
@@ -98,7 +99,12 @@ def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.
     _check_comparable(prediction, ground_truth)
     frames = prediction.num_frames
     with np.errstate(invalid="ignore", over="ignore"):  # broken frames are handled below
-        error = (displacement(prediction.pos, ground_truth.pos[:frames], ground_truth.metadata) ** 2).mean(axis=(1, 2))
+        square = displacement(prediction.pos, ground_truth.pos[:frames], ground_truth.metadata) ** 2
+        if prediction.alive is None or ground_truth.alive is None:
+            error = square.mean(axis=(1, 2))
+        else:
+            both = prediction.alive & ground_truth.alive[:frames]
+            error = np.where(both, square.mean(axis=2), 0.0).sum(axis=1) / np.maximum(1, both.sum(axis=1))
     missing = ground_truth.num_frames - frames if prediction.termination is not None else 0
     # Frames after a broken one are meaningless, even if their numbers are finite.
     broken = np.logical_or.accumulate(~np.isfinite(error))
@@ -118,7 +124,8 @@ def _check_comparable(prediction: Trajectory, ground_truth: Trajectory) -> None:
         raise ValueError(
             f"{prediction.num_frames} predicted frames but only {ground_truth.num_frames} of ground truth; cut with Trajectory.frames"
         )
-    start = np.abs(displacement(prediction.pos[0], ground_truth.pos[0], ground_truth.metadata)).max()
+    there = slice(None) if ground_truth.alive is None else ground_truth.alive[0]
+    start = np.abs(displacement(prediction.pos[0], ground_truth.pos[0], ground_truth.metadata)[there]).max(initial=0.0)
     if not start <= 0.01 * ground_truth.metadata.spacing:
         raise ValueError(
             f"frame 0 differs by {start:.3g} m: the prediction must start at frame 0 of the ground truth (see Trajectory.frames)"
@@ -306,6 +313,9 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     fraction_outside       1      fraction of predicted particle positions deeper than a thousandth of the spacing in a wall or obstacle
     ====================== ====== ====================================================================================================
 
+    Open scenes have ``rollout_mse`` and ``final_mse`` over the nodes in both rollouts, ``energy_distance`` and ``fraction_outside`` over those that are
+    there, and the metrics of ``open_scenes.open_metrics``.
+
     Energy distance and angular momentum are undefined in periodic domains and left out. ``fraction_outside`` is left out if the boundary has no shapes. Meshes
     also have the metrics of ``bodies.body_metrics``, and liquids those of ``liquids.liquid_metrics`` in frame h.
 
@@ -317,9 +327,11 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     Raises:
         ValueError: a horizon is not positive, or as in ``per_frame_mse``.
     """
+    if ground_truth.alive is not None:
+        return _open_records(prediction.with_nodes_of(ground_truth), ground_truth, horizons)
     error = per_frame_mse(prediction, ground_truth)
     periodic = any(ground_truth.metadata.periodic)
-    undefined = {*bodies.UNITS, *(("energy_distance", "angular_momentum_error") if periodic else ())}
+    undefined = {*bodies.UNITS, *open_scenes.UNITS, *(("energy_distance", "angular_momentum_error") if periodic else ())}
     if prediction.stress is None or ground_truth.stress is None:
         undefined |= {"von_mises_error", "stress_error"}
     if not ground_truth.boundary.shapes:
@@ -361,6 +373,29 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
                 values["energy_distance"] = _cloud_distance(prediction, ground_truth, steps)
             if own_bodies is not None and true_bodies is not None:
                 values |= body_metrics(own_bodies, true_bodies, steps)
+        records += [Record(name, horizon, value) for name, value in values.items()]
+    return records
+
+
+def _open_records(prediction: Trajectory, ground_truth: Trajectory, horizons: Sequence[Horizon]) -> list[Record]:
+    """Return the records of ``rollout_metrics`` for an open scene."""
+    error, records = per_frame_mse(prediction, ground_truth), []
+    names = ["rollout_mse", "final_mse", *open_scenes.UNITS]
+    names += ["fraction_outside"] if ground_truth.boundary.shapes else []
+    names += [] if any(ground_truth.metadata.periodic) else ["energy_distance"]
+    for horizon, steps in _reached(horizons, error, ground_truth):
+        values = dict.fromkeys(names, math.inf)
+        if np.isfinite(error[: steps + 1]).all():
+            values["rollout_mse"], values["final_mse"] = float(error[1 : steps + 1].mean()), float(error[steps])
+            values |= open_scenes.open_metrics(prediction, ground_truth, steps)
+            there = [open_scenes.present(t)[steps] for t in (prediction, ground_truth)]
+            if "energy_distance" in values and all(mask.any() for mask in there):
+                clouds = [(t.pos[steps, mask], t.mass[mask]) for t, mask in zip((prediction, ground_truth), there, strict=True)]
+                values["energy_distance"] = energy_distance(clouds[0][0], clouds[1][0], clouds[0][1], clouds[1][1])
+            if "fraction_outside" in values:
+                values["fraction_outside"] = fraction_outside(
+                    prediction.frames(1, steps + 1), tolerance=1e-3 * ground_truth.metadata.spacing
+                )
         records += [Record(name, horizon, value) for name, value in values.items()]
     return records
 

@@ -354,7 +354,8 @@ def fraction_outside(trajectory: Trajectory, tolerance: float = 0.0) -> float:
     """Return the fraction of positions, over all frames and nodes, that lie more than ``tolerance`` [m] inside a wall or obstacle."""
     if not trajectory.boundary.shapes or trajectory.pos.size == 0:
         return 0.0
-    distance = signed_distance(trajectory.boundary.shapes, trajectory.pos.astype(np.float64))
+    pos = trajectory.pos if trajectory.alive is None else trajectory.pos[trajectory.alive]
+    distance = signed_distance(trajectory.boundary.shapes, pos.astype(np.float64))
     return float(np.mean(distance < -tolerance))
 
 

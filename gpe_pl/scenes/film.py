@@ -11,6 +11,7 @@ import numpy as np
 
 from gpe_pl.errors import GpeError
 from gpe_pl.export.trajectories import write_npz
+from gpe_pl.metrics.open_scenes import entering, leaving
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.browser import open_page
 from gpe_pl.viz.captions import describe, heading, with_heading
@@ -47,13 +48,19 @@ class Film:
         lines = [describe(self.first)]
         for name, rollout in with_heading(self.first, self.others).items():
             line = f"{name}: {(rollout.num_frames - 1) * rollout.metadata.frame_dt:.3g} s in {rollout.num_frames - 1} frames, {rollout.num_nodes} nodes"
-            if rollout is not self.first:
+            if rollout.alive is not None:
+                entered, left = entering(rollout).sum(), leaving(rollout).sum()
+                line += f" in all, of which {entered} entered, {left} left and {rollout.alive[-1].sum()} are there at the end"
+            if rollout is not self.first and rollout.alive is None:
                 line += f"; distance from the {heading(self.first)} {self.distance(name):.3g} m (root mean square)"
             lines.append(line + (f"; stopped early, {rollout.termination.message}" if rollout.termination is not None else ""))
         return "\n".join(lines)
 
     def distance(self, name: str) -> float:
-        """Return the root mean square distance [m] of the nodes of another rollout from those of the first, over the frames that both have."""
+        """Return the root mean square distance [m] of the nodes of another rollout from those of the first, over the frames that both have.
+
+        Nodes of open scenes are at other places after some time, so there the distance says nothing; compare ``metrics.open_scenes``.
+        """
         other = self.others[name]
         count = min(self.first.num_frames, other.num_frames)
         apart = other.pos[1:count].astype(np.float64) - self.first.pos[1:count]

@@ -32,9 +32,11 @@ from gpe_pl.scenes.film import Film
 from gpe_pl.scenes.obstacles import FRICTION, MeshObstacle
 from gpe_pl.scenes.recorded import NotRecorded, recorded_solver, settings
 from gpe_pl.scenes.rollouts import middle_values, predicted, solved
+from gpe_pl.scenes.zones import AT_ONCE, Zone, nodes_of, opening_of, speed_of
 from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
@@ -65,7 +67,7 @@ class Scene:
         gravity: acceleration [m/s²]; None stands for 9.81 downward.
         friction: Coulomb coefficient of the walls, or one per wall by name (``x_low``, ``x_high``, ``y_low``, …).
         title: name of the scene in pictures.
-        bodies, obstacles: parts that were added, by name.
+        bodies, obstacles, zones: parts that were added, by name; zones are inlets and outlets.
         seed: seed of the random displacements of nodes from their lattice.
 
     Raises:
@@ -79,6 +81,7 @@ class Scene:
     bodies: tuple[Body, ...] = ()
     obstacles: tuple[tuple[str, Any], ...] = ()
     seed: int = 0
+    zones: tuple[Zone, ...] = ()
 
     def __post_init__(self) -> None:
         fault = "must have 2 or 3 sides [m], or (low, high) for each axis, such as (1.5, 1.0)"
@@ -182,6 +185,48 @@ class Scene:
         placed = MeshObstacle(Path(mesh), None if at is None else self._vector(name, "at", at), size, up, float(friction))
         return replace(self, obstacles=(*self.obstacles, (name, placed)))
 
+    def inlet(
+        self,
+        material: str,
+        side: str,
+        at: Point,
+        size: Point,
+        speed: float | int | None = None,
+        flow_rate: float | int | None = None,
+        **properties: Any,
+    ) -> Scene:
+        """Add a box that is full of material which enters the scene at a constant speed.
+
+        Args:
+            material: a name of ``schema.MATERIALS`` without mesh.
+            side: side of the box where the material comes from, such as ``x_low``.
+            at, size: low corner and sides of the box [dim] in m. Along the axis of ``side`` it is at least as deep as nodes see each other.
+            speed: speed into the scene [m/s].
+            flow_rate: instead of the speed, volume that enters in a time [m³/s], or area in 2D [m²/s].
+            properties: density and material parameters as in ``block``.
+        """
+        name = f"inlet {len(self.zones) + 1} ({material})"
+        if material not in MATERIALS:
+            raise SceneFault({name: f"unknown material{did_you_mean(str(material), MATERIALS)}; known are {', '.join(MATERIALS)}"})
+        zone = self._zone(name, side, at, size, speed, flow_rate)
+        if zone.speed is None:
+            raise SceneFault({name: f"speed, flow_rate: missing; {AT_ONCE}"})
+        velocity = Opening(tuple(zone.low), tuple(zone.high), side, zone.speed).velocity
+        contains, outline = region.block(zone.low, zone.high)
+        if "velocity" in properties:
+            raise SceneFault({name: "velocity: follows from speed and side; leave it out"})
+        filled = self._with(name, material, zone.low, zone.high, contains, outline, {**properties, "velocity": velocity})
+        return replace(self, zones=(*self.zones, replace(zone, body=filled.bodies[-1])))
+
+    def outlet(self, side: str, at: Point, size: Point, speed: float | int | None = None, flow_rate: float | int | None = None) -> Scene:
+        """Add a box where material leaves the scene.
+
+        Without speed and flow rate, material disappears as soon as it is in the box, so it flows out freely. Otherwise material in the box moves towards
+        ``side`` with the speed, and disappears there. Other arguments as in ``inlet``.
+        """
+        zone = self._zone(f"outlet {len(self.zones) + 1}", side, at, size, speed, flow_rate)
+        return replace(self, zones=(*self.zones, zone if zone.speed is None else replace(zone, speed=-zone.speed)))
+
     # --- rollouts --------------------------------------------------------------------------------------------------------------------------
 
     def predict(self, model: str | None = None, seconds: float | int = 1.0) -> Film:
@@ -235,11 +280,11 @@ class Scene:
         own = simulator.builder.metadata
         if own.dim != self.dim:
             raise SceneFault({"box": f"has {self.dim} axes, the model is for {own.dim}D"}, self)
-        if not self.bodies:
+        if not self._filled:
             raise SceneFault({"": "the scene has no body; add one, such as .block('sand', at=(0.1, 0.0), size=(0.2, 0.4))"}, self)
         rng, faults = np.random.default_rng(self.seed), self._misplaced()
         shapes = self._shapes(own.spacing, faults)
-        values = {body.name: self._values(body, simulator, faults) for body in self.bodies}
+        values = {body.name: self._values(body, simulator, faults) for body in self._filled}
         found: dict[str, Nodes] = {}
         for body in self.bodies:
             if body.name not in faults:
@@ -247,6 +292,8 @@ class Scene:
                     found[body.name] = discretised(body, own.spacing, self._density(body, simulator), rng)
                 except (BodyFault, NotRecorded) as error:
                     faults[body.name] = str(error).removeprefix(f"{body.name}: ")
+        openings = self._openings(simulator, values, faults)
+        found |= {zone.name: nodes_of(opening) for zone, opening in openings if zone.body is not None}
         self._check_contacts(found, shapes, own.spacing, faults)
         solids = [body.name for body in self.bodies if body.material == "solid"]
         if len(solids) > 1:
@@ -254,7 +301,8 @@ class Scene:
         if faults:
             raise SceneFault(faults, self)
         metadata = replace(own, dataset="scene", bounds=self.box, gravity=self.gravity, split="", seed=self.seed)
-        return self._joined(found, values, shapes, own), metadata
+        state = self._joined(found, values, shapes, own)
+        return state.opened([opening for _, opening in openings]) if openings else state, metadata
 
     # --- details ---------------------------------------------------------------------------------------------------------------------------
 
@@ -282,7 +330,7 @@ class Scene:
         return recorded_solver(own, bounds=box, materials=own.materials)
 
     def _shipped(self) -> str:
-        materials = {body.material for body in self.bodies}
+        materials = {body.material for body in self._filled}
         if len(materials) != 1:
             here = ", ".join(sorted(materials)) or "the scene"
             raise SceneFault({"model": f"name one for {here}; shipped models ({', '.join(names())}) have one material each"})
@@ -313,6 +361,41 @@ class Scene:
         body = Body(name, material, low, high, contains, outline, velocity, parameters, density)
         return replace(self, bodies=(*self.bodies, body))
 
+    @property
+    def _filled(self) -> tuple[Body, ...]:
+        """Bodies, and what is in inlets at the start."""
+        return (*self.bodies, *(zone.body for zone in self.zones if zone.body is not None))
+
+    def _zone(self, name: str, side: str, at: Point, size: Point, speed: Any, flow_rate: Any) -> Zone:
+        sides = [f"{axis}_{end}" for axis in "xyz"[: self.dim] for end in ("low", "high")]
+        if side not in sides:
+            raise SceneFault({name: f"side={side!r}: must be one of {', '.join(sides)}"})
+        low, lengths = self._vector(name, "at", at), self._vector(name, "size", size)
+        self._positive(name, "size", *lengths.tolist())
+        for key, value in (("speed", speed), ("flow_rate", flow_rate)):
+            if value is not None:
+                self._positive(name, key, value)
+        try:
+            return Zone(name, low, low + lengths, side, speed_of(low, low + lengths, side, speed, flow_rate))
+        except BodyFault as fault:
+            raise SceneFault({name: str(fault)}) from None
+
+    def _openings(
+        self, simulator: LearnedSimulator, values: Mapping[str, dict[str, float]], faults: dict[str, str]
+    ) -> list[tuple[Zone, Opening]]:
+        """Return the openings of the zones; faults are added to ``faults``."""
+        own, openings = simulator.builder.metadata, []
+        for zone in self.zones:
+            if zone.name in faults:
+                continue
+            params = [values[zone.name].get(name, math.nan) if zone.body is not None else math.nan for name in own.param_names]
+            try:
+                mass = 0.0 if zone.body is None else self._density(zone.body, simulator) * own.spacing**self.dim
+                openings.append((zone, opening_of(zone, own.spacing, own.connectivity_radius, mass, params)))
+            except (BodyFault, NotRecorded) as error:
+                faults[zone.name] = str(error)
+        return openings
+
     def _plane(self, name: str) -> None:
         if self.dim != 2:
             raise SceneFault({name: f"exists in 2D only, the box has {self.dim} axes"})
@@ -333,9 +416,10 @@ class Scene:
                 raise SceneFault({name: f"{key}={value!r}: must be a positive number"})
 
     def _misplaced(self) -> dict[str, str]:
-        """Return the bodies that reach out of the box, with how far."""
+        """Return the bodies and zones that reach out of the box, with how far."""
         faults = {}
-        for body in self.bodies:
+        parts: tuple[Body | Zone, ...] = (*self.bodies, *self.zones)
+        for body in parts:
             for axis, (low, high) in enumerate(self.box):
                 if body.low[axis] < low - 1e-9 or body.high[axis] > high + 1e-9:
                     reach = f"from {body.low[axis]:g} to {body.high[axis]:g} m along {'xyz'[axis]}"
@@ -393,7 +477,7 @@ class Scene:
         pos = np.concatenate([nodes.pos for nodes in found.values()])
         params, first, cells = np.full((len(pos), len(own.param_names)), np.nan), 0, []
         vel, node_type = np.empty_like(pos), np.empty(len(pos), np.uint8)
-        for body in self.bodies:
+        for body in self._filled:
             nodes = found[body.name]
             rows = slice(first, first + len(nodes.pos))
             vel[rows], node_type[rows] = body.velocity, node_code(body.material)

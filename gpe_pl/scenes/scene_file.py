@@ -8,6 +8,9 @@ Example::
     obstacles:
       - {circle: [0.7, 0.2], radius: 0.1}
       - {mesh: part.stl, at: [0.4, 0.0], size: 0.2}
+    openings:
+      - {inlet: sand, side: y_high, at: [0.4, 0.8], size: [0.1, 0.2], speed: 1.0}
+      - {outlet: x_high, at: [0.9, 0.0], size: [0.1, 1.0]}
 
 Keys are the arguments of ``Scene`` and its methods. The first key of a part names its kind, and holds the first argument. Paths are relative to the scene file.
 """
@@ -28,8 +31,10 @@ from gpe_pl.scenes.scene import Scene, SceneFault
 
 MOST_BYTES = 1_000_000
 """Largest scene file [bytes]."""
-TOP = ("box", "gravity", "friction", "title", "seed", "bodies", "obstacles")
+LISTS = ("bodies", "obstacles", "openings")
+TOP = ("box", "gravity", "friction", "title", "seed", *LISTS)
 BODIES = ("block", "ball", "polygon", "image")
+OPENINGS = ("inlet", "outlet")
 
 
 def _box(low: Any, high: Any, friction: float = FRICTION) -> Box:
@@ -68,7 +73,7 @@ def read_scene(path: Path | str) -> Scene:
             raise SceneFault({str(key): f"unknown key{did_you_mean(str(key), TOP)}; keys are {', '.join(TOP)}"})
     if "box" not in values:
         raise SceneFault({"box": "is missing; give the sides [m], such as box: [1.0, 1.0]"})
-    scene = Scene(**{"title": path.stem, **{key: value for key, value in values.items() if key not in ("bodies", "obstacles")}})
+    scene = Scene(**{"title": path.stem, **{key: value for key, value in values.items() if key not in LISTS}})
     for number, part in enumerate(_list(values, "bodies"), 1):
         kind, first, given = _kind(f"bodies, part {number}", part, BODIES)
         material = str(first)
@@ -83,6 +88,10 @@ def read_scene(path: Path | str) -> Scene:
             scene = _called(where, scene.obstacle, (), {**given, "mesh": path.parent / str(first)}, without=("shape",))
         else:
             scene = scene.obstacle(_called(where, SHAPES[kind], (first,), given))
+    for number, part in enumerate(_list(values, "openings"), 1):
+        kind, first, given = _kind(f"openings, part {number}", part, OPENINGS)
+        where = f"{kind} {number}" + (f" ({first})" if kind == "inlet" else "")
+        scene = _called(where, getattr(scene, kind), (str(first),), given)
     return scene
 
 

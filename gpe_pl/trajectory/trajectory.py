@@ -391,8 +391,10 @@ class Trajectory:
 
     def frames(self, start: int, stop: int | None = None) -> Trajectory:
         """Return the frames ``start:stop`` as a trajectory. Nodes that are in none of them are left out."""
+        first, last, _ = slice(start, stop).indices(self.num_frames)
+        if first == 0 and last == self.num_frames:
+            return self
         stress = None if self.stress is None else Stress(self.stress.node[start:stop], self.stress.cell[start:stop])
-        first, _, _ = slice(start, stop).indices(self.num_frames)
         return replace(
             self,
             pos=self.pos[start:stop],
@@ -439,6 +441,32 @@ class Trajectory:
             alive=None if self.alive is None else self.alive[:, nodes],
             **{name: values[nodes] for name, values in per_node.items() if values is not None},
         )
+
+    def with_nodes_of(self, other: Trajectory) -> Trajectory:
+        """Return the trajectory with the further nodes of a longer rollout of the same open scene, which are in this one in no frame."""
+        more = np.arange(other.num_nodes) >= self.num_nodes
+        if self.alive is None or not more.any():
+            return self
+
+        def extended(values: np.ndarray, others: np.ndarray) -> np.ndarray:
+            return np.concatenate([values, others[more].astype(values.dtype)])
+
+        first = other.pos[0, more].astype(self.pos.dtype)
+        return replace(
+            self,
+            pos=np.concatenate([self.pos, np.broadcast_to(first, (self.num_frames, *first.shape))], axis=1),
+            vel=np.pad(self.vel, ((0, 0), (0, int(more.sum())), (0, 0))),
+            alive=np.pad(self.alive, ((0, 0), (0, int(more.sum())))),
+            node_type=extended(self.node_type, other.node_type),
+            mass=extended(self.mass, other.mass),
+            material_params=extended(self.material_params, other.material_params),
+        )
+
+    def with_absent_hidden(self) -> Trajectory:
+        """Return the trajectory for pictures: where a node is not in an open scene, its position and velocity are NaN."""
+        if self.alive is None:
+            return self
+        return replace(self, pos=np.where(self.alive[..., None], self.pos, np.nan), vel=np.where(self.alive[..., None], self.vel, np.nan))
 
     def with_moving_boundary(self) -> Trajectory:
         """Return the trajectory with moving boundary nodes as additional nodes of type ``boundary``, for pictures and other programs.

@@ -30,6 +30,12 @@ def with_heading(first: Trajectory, others: Mapping[str, Trajectory]) -> dict[st
     return {name: first, **others}
 
 
+def pictured(first: Trajectory, others: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
+    """Return ``with_heading`` with moving boundary nodes as nodes, and NaN as the position of nodes that are not in an open scene."""
+    named = with_heading(first, others)
+    return {name: t.with_nodes_of(first).with_moving_boundary().with_absent_hidden() for name, t in named.items()}
+
+
 def parameter_name(parameter: MaterialParameter) -> str:
     """Return the name of a material parameter in words."""
     return parameter.name.replace("_", " ").replace("youngs", "Young’s").replace("poisson", "Poisson’s")

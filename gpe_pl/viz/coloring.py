@@ -52,7 +52,7 @@ class Coloring:
     """Colours of all trajectories in one figure, on a common scale.
 
     Args:
-        by: quantity. ``error`` is the distance from ``truth``; ``height`` is the height in the first frame, which makes mixing visible; ``material``,
+        by: quantity. ``error`` is the distance from ``truth``; ``height`` is the height in its first frame, which makes mixing visible; ``material``,
             ``speed`` and ``von_mises`` (of a mesh) are named after their quantities.
         trajectories: all trajectories in the figure.
         frames: the frames in the figure.
@@ -104,7 +104,8 @@ class Coloring:
             nodes = np.where(in_mesh, von_mises(trajectory.stress.node[frame]), np.nan)
             return nodes, von_mises(trajectory.stress.cell[frame]).astype(float)
         if self.by == "height":
-            nodes = trajectory.pos[0, :, vertical_axis(trajectory)].astype(float)
+            first = 0 if trajectory.alive is None else trajectory.alive.argmax(axis=0)  # the frame in which a node enters
+            nodes = trajectory.pos[first, np.arange(trajectory.num_nodes), vertical_axis(trajectory)].astype(float)
         elif self.by == "material":
             nodes = trajectory.node_type.astype(float)
         elif self.by == "speed":

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from gpe_pl.trajectory.trajectory import Trajectory
-from gpe_pl.viz.captions import with_heading
+from gpe_pl.viz.captions import pictured
 from gpe_pl.viz.coloring import PALETTE, ColorBy, Coloring
 from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip, new_figure
 
@@ -43,7 +43,7 @@ def rollout_figure(
     Raises:
         ValueError: ``num_columns`` is not positive, no trajectory has the values for ``color``, or a prediction has the name of the first row.
     """
-    rows = {name: trajectory.with_moving_boundary() for name, trajectory in with_heading(ground_truth, predictions).items()}
+    rows = pictured(ground_truth, predictions)
     frames = evenly_spaced_frames(ground_truth.num_frames, num_columns)
     coloring = Coloring(color, list(rows.values()), frames, next(iter(rows.values())))
     # A name may be longer than its row is high.

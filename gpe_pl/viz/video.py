@@ -15,7 +15,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replacing
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
-from gpe_pl.viz.captions import in_common, with_heading
+from gpe_pl.viz.captions import in_common, pictured
 from gpe_pl.viz.coloring import COLOR_MAPS, REFERENCE, ColorBy, Coloring
 from gpe_pl.viz.panel import Panel
 from gpe_pl.viz.scenery import INK
@@ -57,7 +57,7 @@ def write_animation(
         ModuleNotFoundError: MP4 without imageio-ffmpeg.
     """
     frames = range(0, ground_truth.num_frames, stride) if stride >= 1 else range(0)
-    rows = {name: trajectory.with_moving_boundary() for name, trajectory in with_heading(ground_truth, predictions).items()}
+    rows = pictured(ground_truth, predictions)
     _write(Path(path), rows, frames, fps, color, next(iter(rows.values())), PANEL_PIXELS)
 
 

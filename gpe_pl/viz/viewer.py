@@ -30,7 +30,7 @@ from gpe_pl.geometry.shapes import Bowl, signed_distance
 from gpe_pl.schema import BOUNDARY, NODE_TYPES, node_code
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import AZIMUTH, ELEVATION, vertical_axis
-from gpe_pl.viz.captions import describe, heading, with_heading
+from gpe_pl.viz.captions import describe, heading, pictured, with_heading
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error
 from gpe_pl.viz.contact_sheet import informative_color
 from gpe_pl.viz.panel import DOT, drawn_faces, outline, polygon_edges
@@ -100,7 +100,7 @@ def viewer_page(
     """Return the page that ``write_viewer`` writes, as HTML, and the largest rounding of a shown position [m]; arguments and errors as there."""
     if stride < 1:
         raise ValueError(f"stride must be positive, got {stride}")
-    trajectories = with_heading(ground_truth, predictions or {})
+    trajectories = {name: t.with_nodes_of(ground_truth) for name, t in with_heading(ground_truth, predictions or {}).items()}
     for name, trajectory in trajectories.items():
         if not np.array_equal(trajectory.node_type, ground_truth.node_type):
             raise ViewerError(
@@ -109,7 +109,7 @@ def viewer_page(
             )
     about = ground_truth.metadata
     title = title or " ".join(word for word in (about.dataset, about.split) if word)
-    scene, arrays = _scene({name: trajectory.with_moving_boundary() for name, trajectory in trajectories.items()}, stride)
+    scene, arrays = _scene(pictured(ground_truth, predictions or {}), stride)
     parts = {
         "title": html.escape(title),
         "contents": html.escape(", ".join(trajectories)),
@@ -256,9 +256,10 @@ def _rmse(prediction: Trajectory, truth: Trajectory, frames: Sequence[int]) -> l
     """Return the root mean square of the position error [m] in each frame, or None where the prediction has ended."""
     free = truth.node_type != node_code(BOUNDARY)
     known = [f for f in frames if f < prediction.num_frames]
-    errors = [float(np.sqrt(np.mean(position_error(prediction, truth, f)[free] ** 2))) for f in known] + [np.nan] * (
-        len(frames) - len(known)
-    )
+    errors = [np.nan] * len(frames)
+    for k, frame in enumerate(known):
+        both = free if truth.alive is None or prediction.alive is None else free & truth.alive[frame] & prediction.alive[frame]
+        errors[k] = float(np.sqrt(np.mean(position_error(prediction, truth, frame)[both] ** 2))) if both.any() else np.nan
     return [float(e) if np.isfinite(e) else None for e in errors]
 
 

@@ -16,6 +16,7 @@ from gpe_pl.metrics import (
     bootstrap_ratio,
     energy_distance,
     liquids,
+    open_scenes,
     per_frame_mse,
     rigid,
     rollout_metrics,
@@ -78,6 +79,7 @@ def test_rollout_mse_is_the_mean_over_frames_one_to_horizon(ground_truth):
         *bodies.UNITS,
         *liquids.UNITS,
         *rigid.UNITS,
+        *open_scenes.UNITS,
     }
 
 
@@ -181,6 +183,7 @@ def test_periodic_axes_take_the_short_way():
         *bodies.UNITS,
         *liquids.UNITS,
         *rigid.UNITS,
+        *open_scenes.UNITS,
         "mirror_error",
         "energy_distance",
         "angular_momentum_error",
