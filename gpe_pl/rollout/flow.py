@@ -6,7 +6,7 @@ The time loop calls ``through_openings`` for every simulator. Simulators therefo
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from array_api_compat import array_namespace, device
@@ -16,6 +16,15 @@ from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State
 
 
+@runtime_checkable
+class FollowsNodes(Protocol):
+    """``State.internal`` of a simulator that goes on in open scenes. Another one is lost when nodes enter or leave."""
+
+    def of_rows(self, rows: np.ndarray) -> Any:
+        """Return the internal state of other nodes: those in these rows [node]; −1 stands for a node at rest that is new or moves with an opening."""
+        ...
+
+
 def through_openings(before: State, after: State) -> State:
     """Return the state after a step, with the nodes that are in the scene now.
 
@@ -23,20 +32,21 @@ def through_openings(before: State, after: State) -> State:
         before: state before the step.
         after: state that a simulator made of it, with the same nodes.
     """
-    new = _prescribed(before, after)
+    new, rows = _prescribed(before, after)
     pos = as_numpy(new.pos)
     leaves = np.any([opening.removes(pos) for opening in after.openings], axis=0)
     known: dict[str, Any] = {"num_substeps": after.num_substeps, "num_corrected": after.num_corrected, "num_asleep": after.num_asleep}
     if leaves.any():
-        new = replace(new.take(np.flatnonzero(~leaves)), **known)
+        new, rows = replace(new.take(np.flatnonzero(~leaves)), **known), rows[~leaves]
     for opening in after.openings:
         if len(own := opening.entering(before.time, after.time)):
             new = replace(State.joined([new, _entered(new, opening, own)]), next_id=new.next_id + len(own), **known)
-    return new
+            rows = np.append(rows, np.full(len(own), -1))
+    return replace(new, internal=after.internal.of_rows(rows)) if isinstance(after.internal, FollowsNodes) else new
 
 
-def _prescribed(before: State, after: State) -> State:
-    """Return the state in which nodes of openings with a speed have moved with it."""
+def _prescribed(before: State, after: State) -> tuple[State, np.ndarray]:
+    """Return the state in which nodes of openings with a speed have moved with it, and the row of each node [node], −1 for these nodes."""
     start, pos, vel = as_numpy(before.pos), np.array(as_numpy(after.pos)), np.array(as_numpy(after.vel))
     moved = np.zeros(len(start), bool)
     for opening in after.openings:
@@ -44,13 +54,14 @@ def _prescribed(before: State, after: State) -> State:
             inside = opening.contains(start)
             pos[inside], vel[inside] = start[inside] + (after.time - before.time) * opening.velocity, opening.velocity
             moved |= inside
+    rows = np.where(moved, -1, np.arange(len(moved)))
     if not moved.any():
-        return after
+        return after, rows
     new = after.corrected(_like(after.pos, pos), _like(after.vel, vel))
     if new.frame_velocity is None:
-        return new
+        return new, rows
     at_frame = np.where(moved[:, None], vel, as_numpy(after.frame_velocity))
-    return replace(new, frame_velocity=_like(after.vel, at_frame))
+    return replace(new, frame_velocity=_like(after.vel, at_frame)), rows
 
 
 def _entered(state: State, opening: Opening, pos: np.ndarray) -> State:

@@ -24,7 +24,7 @@ def check_surroundings(state: State, solver: str, computes_open_scenes: bool = F
         axes = ", ".join("xyz"[axis] for axis in state.periodicity.axes)
         raise SimulationError(f"{solver} does not compute periodic domains; the scene repeats along {axes}", reason="input")
     if state.openings and not computes_open_scenes:
-        raise SimulationError(f"{solver} does not compute scenes with inlets and outlets; FLIP does, for liquids", reason="input")
+        raise SimulationError(f"{solver} does not compute scenes with inlets and outlets; FLIP and MPM do", reason="input")
     b = state.boundary
     if _moves(b) or np.any(np.asarray(b.restitution) != 0):
         raise SimulationError(f"{solver} supports only boundaries at rest and without restitution", reason="input")

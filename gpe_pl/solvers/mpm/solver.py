@@ -57,6 +57,13 @@ class MPMInternal:
         still = np.zeros((num_nodes, dim, dim))
         return cls(np.tile(np.eye(dim), (num_nodes, 1, 1)), still, still.copy(), np.zeros(num_nodes))
 
+    def of_rows(self, rows: np.ndarray) -> MPMInternal:
+        """Return the state of the particles in these rows [node]; −1 stands for an undeformed particle. Open scenes call it (``rollout.flow``)."""
+        rest, known = self.at_rest(len(rows), self.deformation.shape[-1]), rows >= 0
+        for name in ("deformation", "affine", "gradient", "plastic"):
+            getattr(rest, name)[known] = getattr(self, name)[rows[known]]
+        return replace(rest, last_substep=self.last_substep)
+
 
 @validated_dataclass(frozen=True, config={"extra": "forbid"})
 class MPM:
@@ -67,7 +74,7 @@ class MPM:
 
     Each step advances one frame by substeps that satisfy ``h (c + |v|_max) <= cfl Δ``, ``h² |g| <= cfl Δ / 4`` and ``8 h ν <= Δ²``. Here c is the speed of the
     fastest elastic wave at the present deformation and hardening. Substeps depend on the current state alone, so a restart repeats a run bit by bit.
-    Obstacles must be at least one grid cell thick.
+    Obstacles must be at least one grid cell thick. In openings with a speed, particles are undeformed and have this speed at the beginning of every frame.
 
     Attributes:
         bounds: ``(low, high)`` of the domain along each axis [m]; each extent is a whole multiple of the grid spacing.
@@ -142,7 +149,7 @@ class MPM:
             SimulationError: with reason ``input`` (arrays or obstacles do not fit the solver, or ``internal`` is needed and missing), ``nan``,
                 ``escape`` (a particle left the domain through an open side or started outside) or ``explosion`` (more than ``max_substeps``).
         """
-        check_surroundings(state, "MPM")
+        check_surroundings(state, "MPM", computes_open_scenes=True)
         internal = state.internal if state.internal is not None else MPMInternal.at_rest(state.num_nodes, len(self.bounds))
         particles = self._particles(state, internal)
         if state.internal is None:

@@ -12,7 +12,7 @@ from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import SimulationError, rollout, steps
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.flip import FLIP
-from gpe_pl.solvers.mpm import MPM
+from gpe_pl.solvers.supported import check_surroundings
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State
@@ -75,10 +75,10 @@ def test_an_opening_thinner_than_a_cell_is_refused() -> None:
         solver.step(state)
 
 
-def test_other_solvers_refuse_open_scenes() -> None:
-    _, state, metadata = duct(0.4, 1.2, 1.0, inlet(0.4))
-    with pytest.raises(SimulationError, match="MPM does not compute scenes with inlets and outlets"):
-        MPM(bounds=metadata.bounds, grid_spacing=CELL, materials=("fluid",)).step(state)
+def test_a_solver_without_openings_refuses_open_scenes() -> None:
+    _, state, _ = duct(0.4, 1.2, 1.0, inlet(0.4))
+    with pytest.raises(SimulationError, match="FEM does not compute scenes with inlets and outlets; FLIP and MPM do"):
+        check_surroundings(state, "FEM")
 
 
 @pytest.mark.slow
