@@ -38,6 +38,10 @@ DAM_SECONDS = 0.3
 COLUMN_ASPECT, COLUMN_SECONDS = 2, 0.4
 """Height of the column of sand over its half width, and duration of the collapse [s]."""
 
+APART = "distance of nodes from the engine's"
+"""Quantity of scenes with material points: 0 for the engine itself."""
+POINTS = 40
+"""About the number of frames that a record has, evenly spread."""
 COLUMNS = 4
 """Panels of a figure side by side."""
 
@@ -164,18 +168,22 @@ def compared(name: str, candidate: Candidate) -> list[dict[str, Any]]:
         whole = rollout(solver, start, count, candidate.metadata())
         model, _ = predicted(candidate, candidate.simulator.initial_state(whole, history), whole.frames(history))
         by = {"engine": scene.run(candidate, start, count + 1)[history:], "solver": whole.pos[history:], "model": model.pos}
-        times = solver.frame_dt * (history + np.arange(len(by["solver"])))
+        every = max(1, len(by["solver"]) // POINTS)
+        times = solver.frame_dt * (history + np.arange(len(by["solver"])))[::every]
         about = {"engine_name": name, "model": candidate.name, "parameter": candidate.described(value), "spacing": candidate.spacing}
-        about |= {"x": times.round(6).tolist()}
+        about |= {"x": times.round(4).tolist()}
         for quantity, function in scene.quantities.items():
-            records.append(about | {"quantity": quantity} | {key: function(pos, candidate).round(6).tolist() for key, pos in by.items()})
+            records.append(about | {"quantity": quantity} | {key: _listed(function(pos, candidate)[::every]) for key, pos in by.items()})
         if scene.points:
             engine = by["engine"]
-            apart = {
-                key: np.linalg.norm(by[key] - engine[: len(by[key])], axis=-1).mean(axis=1).round(6).tolist() for key in ("solver", "model")
-            }
-            records.append(about | {"quantity": "distance of nodes from the engine's", "engine": [0.0] * len(engine)} | apart)
+            apart = {key: np.linalg.norm(by[key] - engine[: len(by[key])], axis=-1).mean(axis=1)[::every] for key in ("solver", "model")}
+            nothing = [0.0] * len(times)
+            records.append(about | {"quantity": APART, "engine": nothing} | {key: _listed(values) for key, values in apart.items()})
     return records
+
+
+def _listed(values: np.ndarray) -> list[float]:
+    return np.asarray(values).round(5).tolist()
 
 
 def difference(own: Sequence[float], other: Sequence[float], spacing: float) -> float:

@@ -6,14 +6,19 @@ import os
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from gpe_pl.benchmarks.acceptance.scenes import block
+from gpe_pl.benchmarks.acceptance.trial import Candidate
 from gpe_pl.benchmarks.outside import calculix, engines, kratos, splishsplash
 from gpe_pl.benchmarks.outside.engine import EngineError
+from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.fem import FEM
@@ -121,6 +126,38 @@ def test_differences_are_means_in_spacings_until_a_model_stopped() -> None:
     assert engines.drawn([record([2.0])]).keys() == {"engines"} and engines.drawn([]) == {}
 
 
+def test_engine_solver_and_model_are_compared_at_the_same_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of them are one node that rises by 1 m per frame; the model starts with the solver's third frame and stops after three more."""
+
+    def rising(first: int, last: int) -> SimpleNamespace:
+        pos = np.arange(first, last, dtype=float)[:, None, None] * np.array([0.0, 1.0])
+        return SimpleNamespace(pos=pos, frames=lambda start: rising(first + start, last))
+
+    solver = SimpleNamespace(frame_dt=0.1)
+    builder = SimpleNamespace(config=SimpleNamespace(history=2))
+    candidate, spec = Mock(spec=Candidate), Mock(spec=DatasetSpec)
+    spec.configure_mock(solver=solver, scene=SimpleNamespace(materials=("solid",), bounds=UNIT_SQUARE))
+    candidate.configure_mock(
+        name="m", spacing=0.5, values=(1.0, 2.0, 3.0), described=str, metadata=lambda: None,
+        spec=spec,
+        simulator=SimpleNamespace(builder=builder, initial_state=lambda *_: None),
+    )  # fmt: skip
+    monkeypatch.setattr(engines, "rollout", lambda _solver, _start, count, _metadata: rising(0, count + 1))
+    monkeypatch.setattr(engines, "predicted", lambda _candidate, _state, _truth: (rising(2, 6), 0.0))
+    scene = replace(
+        engines.SCENES["calculix"],
+        start=lambda *_: falling_block(0.1, 1.0),
+        run=lambda _c, _s, count: rising(0, count).pos + np.array([0.0, 0.25]),
+        seconds=8.0,
+    )
+    monkeypatch.setitem(engines.SCENES, "calculix", scene)
+    height, apart = engines.compared("calculix", candidate)
+    assert height["x"][:2] == [0.2, 0.4] and len(height["x"]) == 41  # every second one of 81 frames
+    assert height["solver"][:2] == [2.0, 4.0] and height["engine"][:2] == [2.25, 4.25] and height["model"] == [2.0, 4.0]
+    assert apart["solver"] == [0.25] * 41 and apart["model"] == [0.25, 0.25]
+    assert engines.compared("kratos", candidate) == []
+
+
 @pytest.mark.slow
 def test_calculix_lets_a_block_fall_and_bounce() -> None:
     if calculix.is_missing():
@@ -140,7 +177,7 @@ def test_splishsplash_spreads_a_thin_liquid_further_than_a_thick_one() -> None:
     if splishsplash.is_missing():
         pytest.skip("pysplishsplash is not installed")
     thin, thick = (splishsplash.run(cube_of_liquid(v), UNIT_CUBE, SPACING, 5e-3, 30) for v in (2e-3, 0.5))
-    np.testing.assert_allclose(thin[0], cube_of_liquid(1.0).pos, atol=0.2 * SPACING)
+    np.testing.assert_allclose(thin[0], cube_of_liquid(1.0).pos, atol=0.3 * SPACING)
     assert thin.shape == thick.shape == (30, 64, 3)
     assert thin[-1, :, 0].max() > 1.2 * thick[-1, :, 0].max()
     assert (thin > -0.1 * SPACING).all() and (thin < 1 + 0.1 * SPACING).all()
