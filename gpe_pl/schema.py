@@ -93,6 +93,9 @@ MaterialValues = float | Mapping[str, float]
 MESH_MATERIALS = ("elastomer", "solid")
 """Materials whose nodes keep their neighbours. With ``graph.mesh`` their nodes are connected along mesh cells."""
 
+LOADS = ("motion", "force")
+"""What data sets can give of nodes as boundary conditions: the motion of some nodes, and forces on nodes."""
+
 CELL_KINDS: dict[str, tuple[int, int]] = {"triangle": (2, 3), "quadrilateral": (2, 4), "tetrahedron": (3, 4), "hexahedron": (3, 8)}
 """Dimension and number of corners of each kind of mesh cell. Corners are in VTK's order."""
 
@@ -275,6 +278,21 @@ FIELDS: dict[str, Field] = {
         required=False,
         values="numbers of bodies",
     ),
+    "prescribed": Field(
+        ("node",),
+        "uint8",
+        "1",
+        "1 for nodes whose motion is given, such as clamped ones, and 0 for others; without it, no motion is given",
+        required=False,
+        values="0 to 1",
+    ),
+    "force": Field(
+        ("frame", "node", "dim"),
+        "float32",
+        "N",
+        "forces on nodes from each frame to the next, without gravity (per metre of depth in 2D)",
+        required=False,
+    ),
     "cells": Field(
         ("cell", "corner"),
         "int32",
@@ -314,6 +332,7 @@ class FeatureSpec:
         num_levels: number of levels of virtual nodes above meshes.
         islands: whether graphs contain the island of each node, and tell which islands do not touch the boundary.
         cells: whether graphs contain the cells of meshes and their rest shape.
+        loads: loads of nodes that are features of the nodes of materials, names of ``LOADS``.
     """
 
     dim: int
@@ -327,6 +346,7 @@ class FeatureSpec:
     num_levels: int = 0
     islands: bool = False
     cells: bool = False
+    loads: tuple[str, ...] = ()
 
     @property
     def param_channels(self) -> dict[str, int]:

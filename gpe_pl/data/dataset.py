@@ -354,6 +354,7 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             metadata = trajectory.metadata
             velocities = integrators.velocities(trajectory.pos.astype(np.float64), metadata.frame_dt, metadata.periodicity)
             acc = integrators.acceleration(velocities[1:], velocities[:-1], metadata.frame_dt) - np.asarray(metadata.gravity)
+            acc = acc[:, trajectory.is_predicted]
             values.append(np.sqrt(np.mean(acc**2, axis=(1, 2)))[self.builder.config.history - 1 :])
         return np.concatenate(values)
 
@@ -387,6 +388,8 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         if self.noise is not None:
             rng = np.random.default_rng((self.seed, sample))
             pos = self.noise.apply(pos, self.builder.metadata.longest_side, self.velocity_unit, dt, rng)
+            if trajectory.prescribed is not None:  # their motion is given exactly
+                pos = np.where(trajectory.prescribed[:, None], truth[: history + 2], pos)
         velocities = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
         gravity = np.asarray(trajectory.metadata.gravity)
         past = np.ascontiguousarray(velocities[:-1].swapaxes(0, 1))
@@ -409,6 +412,7 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             param_names=trajectory.metadata.param_names,
             frame_velocity=at_frame,
             rigid_body=trajectory.rigid_body,
+            loads=trajectory.loads_at(history),
         ).to_torch()
         stress = None
         if self.stress and trajectory.stress is not None:

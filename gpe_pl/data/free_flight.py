@@ -109,7 +109,7 @@ def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames:
 
     Args:
         metadata: metadata of the trajectory.
-        arrays: arrays by their names in ``schema.FIELDS``: ``pos``, ``mass``, ``boundary_pos`` and, for meshes, ``cells``.
+        arrays: arrays by their names in ``schema.FIELDS``: ``pos``, ``mass``, ``boundary_pos`` and, if there are any, ``cells``, ``prescribed`` and ``force``.
         most_frames: maximum number of frames that are examined, evenly spread.
     """
     pos, mass = arrays["pos"].astype(np.float64), arrays["mass"].astype(np.float64)
@@ -133,10 +133,21 @@ def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames:
         of_nodes = np.diff(window, 2, axis=0)[0] / dt**2
         moves = np.linalg.norm(islands.mean(window[2] - window[1], mass), axis=-1) > AT_REST * radius
         free &= moves
+        free[islands.label[_are_loaded(arrays, frame)]] = False
         acceleration = islands.mean(of_nodes, mass)[free]
         uncertain = resolution / np.sqrt(_independent(islands.label, pos[frame], count)[free])
         rms = float(np.sqrt(np.mean(np.sum(of_nodes**2, axis=-1))))
         yield FreeFlight(count, acceleration, np.broadcast_to(gravity, acceleration.shape), uncertain, np.full(len(acceleration), rms))
+
+
+def _are_loaded(arrays: dict[str, np.ndarray], frame: int) -> np.ndarray:
+    """Return a mask [node] of the nodes whose motion is given, and of those on which a force acts just before or after a frame."""
+    mask = np.zeros(len(arrays["mass"]), bool)
+    if "prescribed" in arrays:
+        mask |= arrays["prescribed"] != 0
+    if "force" in arrays:
+        mask |= (arrays["force"][frame - 1 : frame + 1] != 0).any(axis=(0, 2))
+    return mask
 
 
 def _independent(label: np.ndarray, pos: np.ndarray, count: int) -> np.ndarray:

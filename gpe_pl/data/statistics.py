@@ -48,11 +48,16 @@ def acceleration_std(trajectories: Iterable[Trajectory]) -> float:
 
 
 def motion(trajectory: Trajectory) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield velocities [m/s] and accelerations without gravity [m/s²] by name, each [frame, node, dim], for a part of the frames at a time."""
+    """Yield velocities [m/s] and accelerations without gravity [m/s²] by name, each [frame, node, dim], for a part of the frames at a time.
+
+    Nodes whose motion is given are left out.
+    """
     dt = trajectory.metadata.frame_dt
     for start in range(0, max(1, trajectory.num_frames - 2), FRAMES_AT_ONCE):
         pos = trajectory.pos[start : start + FRAMES_AT_ONCE + 2].astype(np.float64)
         vel = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
+        if trajectory.prescribed is not None:
+            vel = vel[:, trajectory.is_predicted]
         yield "velocity", vel[1:] if start else vel
         yield "acceleration", integrators.acceleration(vel[1:], vel[:-1], dt) - np.asarray(trajectory.metadata.gravity)
 

@@ -23,6 +23,7 @@ from gpe_pl.graphs.batching import batched
 from gpe_pl.learned.ensemble import LearnedEnsemble, configured, members_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, rollout_metrics
+from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.schema import param_names
 from gpe_pl.system.progress import Bars, no_bar
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -167,5 +168,6 @@ def one_step_nmse(
             unit = members[0].acceleration_std.float()
             for material in predicted[0]:
                 values = [own[material] * (member.acceleration_std.float() / unit) for own, member in zip(predicted, members, strict=True)]
-                metric.update(torch.stack(values).mean(dim=0), batches[0][material].target / unit)
+                store, mean = batches[0][material], torch.stack(values).mean(dim=0)
+                metric.update(predicted_rows(store, mean), predicted_rows(store, store.target / unit))
     return float(metric.compute())

@@ -61,6 +61,8 @@ def check(simulator: LearnedSimulator) -> None:
         wrong = f"a model in {builder.metadata.dim}D"
     elif builder.metadata.periodicity:
         wrong = "a model of a periodic domain"
+    elif builder.spec.loads:
+        wrong = "a model of scenes with prescribed nodes or forces"
     elif len(builder.spec.materials) > 1:
         wrong = f"a model of several materials ({', '.join(builder.spec.materials)})"
     elif different := [f"model.{key}={model.settings[key]}" for key, value in wanted.items() if model.settings[key] != value]:

@@ -36,6 +36,7 @@ from gpe_pl.graphs.features import (
     scales_of,
     virtual_features,
 )
+from gpe_pl.graphs.load_features import add_loads
 from gpe_pl.graphs.neighbors import Points, are_below, check_crowding
 from gpe_pl.graphs.search import as_array, find_topology, rows_of
 from gpe_pl.graphs.standards import Standards, raw
@@ -78,6 +79,8 @@ class GraphBuilder:
     - ``corner_index`` [pair, 2] and ``corner`` [pair, dim + 1], for each pair of an edge of a body and a nearby corner of an obstacle: the nodes at the ends of
       the edge; the vector from the first of them to the corner [m] and the friction of the corner. Empty in 3D
     - ``cell_index``: corners of each cell [cell, 2^dim]; simplices repeat the last one
+
+    In data sets with loads, nodes of materials also have ``prescribed`` [node] and ``load`` [node, dim] (see ``load_features``).
 
     Attributes:
         config: settings of the graph.
@@ -177,7 +180,8 @@ class GraphBuilder:
             standards: statistics with which features are standardised; None leaves them as they are.
         """
         if standards is not None or (compiled_graph.works_on(state) and (topology.mesh is None or topology.mesh.edges is not None)):
-            return self._with_cells(self._compiled(standards or self._raw)(topology, state), topology, state)
+            data = self._compiled(standards or self._raw)(topology, state)
+            return self._with_loads(self._with_cells(data, topology, state), topology, state, standards)
         data, history, boundary = HeteroData(), history_of(state), state.boundary
         for material, r in topology.rows.items():
             store = data[material]
@@ -213,7 +217,12 @@ class GraphBuilder:
                 data[material].body = body
             if self.spec.meshes:
                 data.num_bodies = torch.full((1,), islands.num_bodies, device=arm.device)
-        return self._with_cells(data, topology, state)
+        return self._with_loads(self._with_cells(data, topology, state), topology, state)
+
+    def _with_loads(self, data: HeteroData, topology: Topology, state: State, standards: Standards | None = None) -> HeteroData:
+        if self.spec.loads:
+            add_loads(data, topology, state, self.spec, self.scales, standards, self.precision)
+        return data
 
     def _with_cells(self, data: HeteroData, topology: Topology, state: State) -> HeteroData:
         if self.spec.cells:

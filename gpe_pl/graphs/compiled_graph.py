@@ -102,7 +102,7 @@ class CompiledGraph:
 
     def _material(self, material: str, rows: Tensor, history: np.ndarray, scenes: Scenes, mass: np.ndarray, state: State) -> dict[str, Any]:
         r, scales = rows.numpy(), self.scales
-        x = self._new(len(r), self.spec.node_channels[material])
+        x = self._new(len(r), (history.shape[1] + 1) * self.spec.dim)  # ``load_features`` adds those of loads
         units, statistics = (scales.velocity, scales.acceleration), self.standards.node[material]
         compiled_features.motion(history, r, scenes.gravity, scenes.starts[material], NO_LEVEL, *units, *statistics, x)
         params = self.standards.of_params(material, _array(state.material_params)[r][:, self.metadata.columns_of(material)])

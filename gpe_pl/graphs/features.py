@@ -124,10 +124,16 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     motion = (config.history + 1) * dim
     virtual = {grid(level): motion + 1 for level in range(1, num_levels + 1)}
     channels = {r: _edge_channels(config.features, r, dim) for r in relations}
+    loads = metadata.loads or ()
+    of_loads = (1 + dim) * ("motion" in loads) + dim * ("force" in loads)
     return FeatureSpec(
         dim=dim,
         materials=materials,
-        node_channels={**dict.fromkeys(materials, motion), BOUNDARY: 2 * dim + 2 if config.boundary_condition else dim, **virtual},
+        node_channels={
+            **dict.fromkeys(materials, motion + of_loads),
+            BOUNDARY: 2 * dim + 2 if config.boundary_condition else dim,
+            **virtual,
+        },
         parameters={m: metadata.parameters_of(m) for m in materials},
         relations=relations,
         odd_channels={r: odd for r, (odd, _) in channels.items()},
@@ -136,6 +142,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
         num_levels=num_levels,
         islands=config.islands,
         cells=config.cells,
+        loads=loads,
     )
 
 

@@ -27,8 +27,8 @@ OF_BOUNDARY = ("pos", "vel", "normal", "friction", "restitution")
 
 
 def covers(topologies: Sequence[Topology], states: Sequence[State], spec: FeatureSpec) -> bool:
-    """Tell whether ``joined_graph`` can make the batch of these scenes: they have no meshes, and one periodicity."""
-    if spec.cells or any(t.mesh is not None or t.periodicity != topologies[0].periodicity for t in topologies):
+    """Tell whether ``joined_graph`` can make the batch of these scenes: they have no meshes and no loads, and one periodicity."""
+    if spec.cells or spec.loads or any(t.mesh is not None or t.periodicity != topologies[0].periodicity for t in topologies):
         return False
     return all(map(works_on, states))
 
@@ -79,7 +79,7 @@ def joined_graph(compiled: CompiledGraph, topologies: Sequence[Topology], states
 
 def _joined_state(states: Sequence[State]) -> State:
     walls: dict[str, Any] = {name: torch.cat([getattr(s.boundary, name) for s in states]) for name in OF_BOUNDARY}
-    nodes = State.joined([replace(s, cells=None, rest_pos=None, frame_velocity=None) for s in states])
+    nodes = State.joined([replace(s, cells=None, rest_pos=None, frame_velocity=None, loads=None) for s in states])
     return replace(nodes, boundary=Boundary(**walls))
 
 

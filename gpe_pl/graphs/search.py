@@ -53,6 +53,8 @@ def find_topology(
         pairs = parts.contacts(pairs, scales.radius)
     walls = radius_between(walls_of(state, scales.radius, skips.static_boundary), points, scales.radius, space)
     touched = walls[1]
+    if state.loads is not None:  # what holds a prescribed node acts from outside, as walls do
+        touched = np.concatenate([touched, state.loads.rows])
     boundary_rows = None
     if config.trim_boundary:
         walls, boundary_rows = _trimmed(walls, state.boundary.pos.shape[0])
@@ -147,7 +149,7 @@ def _islands(
     Args:
         points: nodes.
         pairs: pairs of nodes with an edge within the radius.
-        touched: nodes with an edge to the boundary.
+        touched: nodes with an edge to the boundary, and nodes whose motion is given.
         parts: meshes of the scene.
         rows: rows of each material's nodes in the state.
         spec: node types of the graph.

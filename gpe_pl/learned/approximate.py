@@ -21,6 +21,7 @@ from gpe_pl.rollout.loop import SimulationError, Simulator, sound, step_all
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.boundary import search_tree
 from gpe_pl.trajectory.cells import cell_edges, mean_over_corners
+from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.state import State, Stress
 
 
@@ -54,7 +55,8 @@ class _Rest:
 class Sleeping(Batched):
     """Simulator in which islands at rest sleep: their nodes keep their positions and are not computed.
 
-    An island wakes up when a node that is awake, or a wall that moves with a prescribed motion, comes within the radius of the graph.
+    An island wakes up when a node that is awake, or a wall that moves with a prescribed motion, comes within the radius of the graph, and when a force acts on
+    one of its nodes or a given motion moves one.
 
     An island (see ``graphs.islands``) falls asleep if all its nodes have been at rest in the last ``Skips.sleep_after`` predictions.
     ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` limit velocities at rest: those at the frame if the model predicts them, otherwise
@@ -90,6 +92,8 @@ class Sleeping(Batched):
             return everything, everything
         pos = np.ascontiguousarray(state.pos.cpu().numpy())
         is_calm &= ~self._are_near_a_moving_wall(state, pos)
+        if state.loads is not None:
+            is_calm &= ~_are_loaded(state.loads)
         cells = np.empty((0, 2), np.int64) if state.cells is None else state.cells.cpu().numpy()
         edges, space = cell_edges(cells, len(pos)), state.periodicity
         islands = islands_within(self.radius, pos, walls_of(state, self.radius), edges, space)
@@ -137,6 +141,13 @@ class Sleeping(Batched):
             lost_impulse=float((state.mass * before.norm(dim=1))[~awake].sum()),
             internal=_Rest(count),
         )
+
+
+def _are_loaded(loads: Loads) -> np.ndarray:
+    """Return a mask [node] of the nodes that their given motion or a force moves."""
+    moves = np.zeros(len(loads.prescribed), dtype=bool)
+    moves[loads.rows] = (loads.next_positions() != loads.path[0]).any(axis=1)
+    return moves if loads.force is None else moves | (loads.force[0] != 0).any(axis=1)
 
 
 def _rest_of(state: State) -> Tensor:

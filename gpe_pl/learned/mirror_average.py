@@ -80,12 +80,14 @@ class MirrorAverage:
         back = [reflection.state(image, state.boundary) for reflection, image in images]
         changes = [state.periodicity.shortest(other.pos - state.pos) for other in back]
         stress = [s.stress for s in (state, *back) if s.stress is not None]
+        mean = [_mean([getattr(s, name) for s in (state, *back)]) for name in ("vel", "velocity_history", "frame_velocity")]
+        pos = state.pos + sum(changes) / (1 + len(back))
+        values = {"pos": pos, "vel": mean[0], "velocity_history": mean[1], "frame_velocity": mean[2]}
+        if state.loads is not None:  # an average would round the given motion
+            values = {name: v if v is None else state.loads.at_prescribed(getattr(state, name), v) for name, v in values.items()}
         return replace(
             state,
-            pos=state.pos + sum(changes) / (1 + len(back)),
-            vel=_mean([s.vel for s in (state, *back)]),
-            velocity_history=_mean([s.velocity_history for s in (state, *back)]),
-            frame_velocity=_mean([s.frame_velocity for s in (state, *back)]),
+            **values,
             stress=Stress(_mean([s.node for s in stress]), _mean([s.cell for s in stress])) if stress else None,
         )
 

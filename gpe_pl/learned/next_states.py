@@ -68,10 +68,15 @@ def keep_slow(state: State, new: State, topology: Topology, duration: float) -> 
         duration: time in which gravity gives the speed below which a node keeps its position [s].
     """
     assert topology.islands is not None
+    given = None if state.loads is None else (new.pos.clone(), new.vel.clone())
     history = new.vel[:, None] if new.velocity_history is None else new.velocity_history
     at_frame = new.vel if new.frame_velocity is None else new.frame_velocity
     before = (state.pos.numpy(), state.vel.numpy(), topology.islands.label.numpy(), topology.islands.is_free.numpy())
     _keep_slow(*before, state.gravity.numpy(), duration, new.pos.numpy(), new.vel.numpy(), history.numpy(), at_frame.numpy())
+    if state.loads is not None and given is not None:  # static friction does not stop nodes whose motion is given
+        rows = torch.from_numpy(state.loads.rows)
+        for values, moved_as_given in ((new.pos, given[0]), (new.vel, given[1]), (history[:, -1], given[1]), (at_frame, given[1])):
+            values[rows] = moved_as_given[rows]
 
 
 def advanced(state: State, acc: Tensor, dt: float) -> State:
@@ -88,7 +93,9 @@ def accelerations(states: list[State], rows: Sequence[Rows], predicted: dict[str
 
 
 def with_frame_velocity(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor], dt: float) -> list[State]:
-    """Return states with the field ``frame_velocity``, if a model predicts velocities at the frame. Nodes without a prediction get their mean velocity.
+    """Return states with the field ``frame_velocity``, if a model predicts velocities at the frame.
+
+    Nodes without a prediction, and those whose motion is given, get their mean velocity.
 
     Args:
         states: the states one frame later, as ``moved`` returns them.
@@ -101,7 +108,8 @@ def with_frame_velocity(states: list[State], rows: Sequence[Rows], predicted: di
     at_frame = [state.vel.clone() for state in states]
     for scene, own, part in per_scene(predicted, rows):
         at_frame[scene] = at_frame[scene].index_copy(0, own, part.double() / dt)
-    return [replace(state, frame_velocity=velocity) for state, velocity in zip(states, at_frame, strict=True)]
+    kept = [v if s.loads is None else s.loads.at_prescribed(s.vel, v) for s, v in zip(states, at_frame, strict=True)]
+    return [replace(state, frame_velocity=velocity) for state, velocity in zip(states, kept, strict=True)]
 
 
 def with_stress(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor], unit: Tensor, components: int) -> list[State]:

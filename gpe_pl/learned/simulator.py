@@ -41,7 +41,9 @@ from gpe_pl.learned.training_ranges import named_materials, outside_masses, outs
 from gpe_pl.learned.transfer import Transfer
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
+from gpe_pl.nn.node_loads import scaled
 from gpe_pl.nn.static_friction import keeps_position, supported
+from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.rollout.loop import SimulationError, sound
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, EdgeType, node_code
@@ -170,7 +172,7 @@ class LearnedSimulator(nn.Module):
             log.warning(
                 "not in the training windows that statistics are taken from: %s; its features are not standardised", ", ".join(missing)
             )
-        target = torch.cat([g[m].target for g in sample for m in self.builder.spec.materials]).double()
+        target = torch.cat([predicted_rows(g[m], g[m].target) for g in sample for m in self.builder.spec.materials]).double()
         rms = target.square().mean().sqrt()
         if not torch.isfinite(rms) or rms == 0:
             raise ValueError(
@@ -244,7 +246,9 @@ class LearnedSimulator(nn.Module):
     def forward(self, data: HeteroData) -> Prediction:
         """Return the model's prediction for a graph whose features are not standardised."""
         limits = dict(self.trained_ranges()) if self.clamps_parameters else None
-        return self.model(self.standardizer(data, self.skips.absent_types, limits))
+        return self.model(
+            scaled(self.standardizer(data, self.skips.absent_types, limits), self.builder.spec.materials, self.acceleration_std)
+        )
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
         """Return the state at a frame with the velocity history that the graph needs, on this model's device.
@@ -277,11 +281,12 @@ class LearnedSimulator(nn.Module):
         return self._checked(replace(state, velocity_history=history.clone(), frame_velocity=None), "start")
 
     def fits(self, scene: Metadata) -> bool:
-        """Return whether a scene has the frame interval, spacing (to 1 %), dimension and material parameters of training, and only materials of training."""
+        """Return whether a scene has the frame interval, spacing (to 1 %), dimension and material parameters of training, and only its materials and loads."""
         own = self.builder.metadata
         same_scales = abs(scene.frame_dt / own.frame_dt - 1) < 1e-6 and abs(scene.spacing / own.spacing - 1) < 0.01
         same_channels = scene.dim == own.dim and scene.param_names == own.param_names
-        return same_scales and same_channels and {*scene.materials} <= {*own.materials}  # materials can share their parameters
+        known_loads = {*(scene.loads or ())} <= {*(own.loads or ())}
+        return same_scales and same_channels and known_loads and {*scene.materials} <= {*own.materials}  # materials can share parameters
 
     def check_scene(self, scene: Metadata, choice: str = "") -> None:
         """Raise an error for a scene that does not fit. The message recommends ``choice``; by default a stride if one makes the scene fit.
@@ -388,7 +393,8 @@ class LearnedSimulator(nn.Module):
             data = builder.batch(topologies, states, standards)
         self._warn_of_unknown(data)
         data = data.to(self.acceleration_std.device) if self.acceleration_std.device != states[0].pos.device else data
-        predicted = (self.model(data) if standards is not None else self(data)).to(states[0].pos.device)
+        units = builder.spec.materials, self.acceleration_std
+        predicted = (self.model(scaled(data, *units)) if standards is not None else self(data)).to(states[0].pos.device)
         new = self.later(states, rows, predicted)
         if self.static_friction and standards is None:
             new = [self._with_static_friction(*parts) for parts in zip(states, new, graphs, strict=True)]

@@ -62,6 +62,7 @@ def outside_masses(state: State, materials: Sequence[str], trained: Tensor) -> I
 
 
 def named_materials(metadata: Metadata) -> str:
-    """Return the materials, and the parameters that the data set stores besides the first of each."""
-    further = set(metadata.param_names) - set(param_names(metadata.materials))
-    return ", ".join(metadata.materials) + (f" with {', '.join(sorted(further))}" if further else "")
+    """Return the materials, the parameters that the data set stores besides the first of each, and its loads."""
+    further = sorted(set(metadata.param_names) - set(param_names(metadata.materials)))
+    given = [{"motion": "prescribed nodes", "force": "nodal forces"}[name] for name in metadata.loads or ()]
+    return ", ".join(metadata.materials) + (f" with {', '.join((*further, *given))}" if (further or given) else "")

@@ -1,9 +1,10 @@
 """Errors of predicted trajectories against the ground truth, and their confidence intervals.
 
-Three rules apply to every metric of a rollout:
+Four rules apply to every metric of a rollout:
 
 - Frame 0 is the shared initial state and does not count. A horizon ``h`` means frames 1 to ``h``; ``"full"`` means all frames of the ground truth.
 - A horizon that the ground truth does not reach is left out, never shortened.
+- Nodes whose motion is given do not count in errors of positions and velocities.
 - The error of a rollout is infinite from the frame where it stopped early or has a value that is not finite, so that no failure improves a score.
 
 Velocities of both trajectories are computed from positions (``integrators``). The velocities that a solver stores are instantaneous, while those of a learned
@@ -87,7 +88,9 @@ def displacement(
 
 
 def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.ndarray, "frame"]:
-    """Return the mean squared position error of every frame [m²], over nodes and dimensions. In open scenes, nodes count that are in both at the frame.
+    """Return the mean squared position error of every frame [m²], over dimensions and over nodes whose motion is not given.
+
+    In open scenes, nodes count that are in both at the frame.
 
     Returns:
         One value per frame, including frame 0 (zero up to rounding). If the rollout stopped early, the array has the length of the ground truth, with ``inf``
@@ -99,16 +102,22 @@ def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.
     _check_comparable(prediction, ground_truth)
     frames = prediction.num_frames
     with np.errstate(invalid="ignore", over="ignore"):  # broken frames are handled below
-        square = displacement(prediction.pos, ground_truth.pos[:frames], ground_truth.metadata) ** 2
+        own, true = (_computed(ground_truth, pos) for pos in (prediction.pos, ground_truth.pos[:frames]))
+        square = displacement(own, true, ground_truth.metadata) ** 2
         if prediction.alive is None or ground_truth.alive is None:
             error = square.mean(axis=(1, 2))
         else:
-            both = prediction.alive & ground_truth.alive[:frames]
+            both = _computed(ground_truth, prediction.alive & ground_truth.alive[:frames])
             error = np.where(both, square.mean(axis=2), 0.0).sum(axis=1) / np.maximum(1, both.sum(axis=1))
     missing = ground_truth.num_frames - frames if prediction.termination is not None else 0
     # Frames after a broken one are meaningless, even if their numbers are finite.
     broken = np.logical_or.accumulate(~np.isfinite(error))
     return np.concatenate([np.where(broken, math.inf, error), np.full(missing, math.inf)])
+
+
+def _computed(ground_truth: Trajectory, values: np.ndarray) -> np.ndarray:
+    """Return the values [frame, node, …] of the nodes that a simulator computes."""
+    return values if ground_truth.prescribed is None else values[:, ground_truth.is_predicted]
 
 
 def _check_comparable(prediction: Trajectory, ground_truth: Trajectory) -> None:
@@ -184,10 +193,12 @@ def _cloud_distance(prediction: Trajectory, ground_truth: Trajectory, frame: int
     mass, types = ground_truth.mass.astype(np.float64), ground_truth.node_type
     total = 0.0
     for code in np.unique(types):
-        own = types == code
+        own = (types == code) & ground_truth.is_predicted
+        if not own.any():
+            continue
         distance = energy_distance(prediction.pos[frame, own], ground_truth.pos[frame, own], mass[own], mass[own])
         total += distance * float(mass[own].sum())
-    return total / float(mass.sum())
+    return total / float(mass[ground_truth.is_predicted].sum())
 
 
 def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: int) -> dict[str, float]:
@@ -195,7 +206,7 @@ def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps
 
     An error is infinite if that norm is zero and the error is not.
     """
-    own, true = prediction.pos[: num_steps + 1], ground_truth.pos[: num_steps + 1]
+    own, true = (_computed(ground_truth, t.pos[: num_steps + 1]) for t in (prediction, ground_truth))
     metadata = ground_truth.metadata
     steps, true_steps = displacement(own[1:], own[:-1], metadata), displacement(true[1:], true[:-1], metadata)
     errors = {

@@ -10,7 +10,6 @@ The model is an encoder, processor and decoder over typed nodes and relations, w
 Virtual nodes above meshes are nodes of separate types. They pass messages, and nothing is decoded from them. A message moves up one level per step.
 """
 
-from collections.abc import Iterable
 from functools import partial
 from typing import Annotated, Any, Literal, cast
 
@@ -28,8 +27,9 @@ from gpe_pl.nn.connected import Edges, merged_levels, order_of_edges, renumbered
 from gpe_pl.nn.elastic_bodies import CellError, ElasticBodies
 from gpe_pl.nn.fused import works_on
 from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_processor
-from gpe_pl.nn.island_momentum import IslandMomentum, conserve, moved_by_contacts
+from gpe_pl.nn.island_momentum import IslandMomentum, conserve, grouped, joined, moved_by_contacts
 from gpe_pl.nn.momentum_conv import RAW, EdgeState, Implementation, Interaction, MomentumConv, orient
+from gpe_pl.nn.node_loads import loads_of, plus, without_held_bodies
 from gpe_pl.schema import CELL, MESH_MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
 Decoder = Literal["node", "pair", "contact"]
@@ -141,20 +141,6 @@ def _update(mlp: Any) -> Update:
     first, act, last, *norm = mlp
     gain, shift = (norm[0].weight, norm[0].bias) if norm else (None, None)
     return Update(first.weight, first.bias, act.weight, last.weight, last.bias, gain, shift)
-
-
-def _joined(parts: list[Tensor]) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat(parts)
-
-
-def _grouped(data: HeteroData, materials: Iterable[str], name: str, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return mass, position and group (``island`` or ``body``) of the nodes of these materials; graphs of a batch number groups from 0; −1: no group."""
-    stores = [data[m] for m in materials]
-    if len(stores) == 1 and "batch" not in stores[0]:
-        return stores[0].mass, stores[0].pos, stores[0][name]
-    start = torch.cumsum(count, dim=0) - count
-    group = torch.cat([torch.where(s[name] < 0, s[name], s[name] + start[s.batch]) if "batch" in s else s[name] for s in stores])
-    return torch.cat([s.mass for s in stores]), torch.cat([s.pos for s in stores]), group
 
 
 class GPE(Model):
@@ -355,12 +341,17 @@ class GPE(Model):
         """
         keep_absent = not (self.training or self.skips.absent_types)
         acceleration, stress, contact = self._compiled(data, keep_absent) or self._uncompiled(data, keep_absent)
+        elastic = self.settings["elastic"]
+        load, load_by_law = loads_of(data, acceleration, self.spec.meshes if elastic else ())
+        if self.decoder == "pair":
+            acceleration = plus(acceleration, load)
         if contact:
-            acceleration = self._moved_by_contacts(data, acceleration, contact)
-        if acceleration and self.settings["island_momentum"] != "ignored":
-            acceleration = self._conserve(data, acceleration)
+            acceleration = self._moved_by_contacts(data, acceleration, plus(contact, load))
+        if acceleration and self.settings["island_momentum"] != "ignored":  # forces change it
+            acceleration = plus(self._conserve(data, plus(acceleration, load, -1.0)), load)
         velocity: dict[str, Tensor] = {}
-        if self.settings["elastic"]:
+        if elastic:
+            acceleration = plus(acceleration, load_by_law)
             params = {m: data[m].material_params for m in self.material_embedding if m in acceleration}
             mass = {m: data[m].mass for m in acceleration}
             with_stress = self._wants_stress and bool(self.spec.stress_channels)
@@ -396,18 +387,20 @@ class GPE(Model):
 
     def _moved_by_contacts(self, data: HeteroData, acceleration: dict[str, Tensor], contact: dict[str, Tensor]) -> dict[str, Tensor]:
         """Replace the rigid part of the accelerations of each body by that of its contacts; graphs without cells have no bodies."""
-        mass, pos, body = _grouped(data, contact, "body", data.num_bodies)
+        mass, pos, body = grouped(data, contact, "body", data.num_bodies)
         count = body.shape[0] if torch.compiler.is_exporting() else int(data.num_bodies.sum())  # upper bound of the number
-        forces, own = _joined([*contact.values()]), _joined([acceleration[m] for m in contact])
+        forces, own = joined([*contact.values()]), joined([acceleration[m] for m in contact])
+        if not self.settings["elastic"]:
+            body = without_held_bodies(data, [*contact], body, count)
         # with the law, forces act where the contact is, and cells pass them on
         new = moved_by_contacts(own, forces, mass, pos, body, count, not self.settings["elastic"], bool(self.settings["only_contacts"]))
         parts = new.split([a.shape[0] for a in contact.values()])
         return acceleration | dict(zip(contact, parts, strict=True))
 
     def _conserve(self, data: HeteroData, acceleration: dict[str, Tensor]) -> dict[str, Tensor]:
-        mass, pos, island = _grouped(data, acceleration, "island", data.num_islands)
+        mass, pos, island = grouped(data, acceleration, "island", data.num_islands)
         angular = self.settings["island_momentum"] == "angular"
-        kept = conserve(_joined([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
+        kept = conserve(joined([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
         return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 
     def _compute_in_order(

@@ -19,6 +19,8 @@ from gpe_pl.nn.elastic_bodies_kernels import move_bodies
 from gpe_pl.nn.elastic_motion import LOGARITHM_SCALE, MAX_SUBSTEPS, STABLE, Cells, Constants, Corners, Walls, cauchy_stress, elastic_motion
 from gpe_pl.system.compiled import is_wanted
 
+HEAVY = 1e9
+"""Mass of nodes whose motion is given, in mean masses. Cells pull at them and do not change their velocity."""
 MAX_CACHED = 64
 """Largest number of graphs whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
 ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "cell_index", "corner_index", "corner")
@@ -109,6 +111,8 @@ class ElasticBodies(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         if "ptr" in data[m]:
             raise CellError("PyTorch Geometric's Batch does not renumber cells; join graphs with gpe_pl.graphs.batching.batched")
+        if "prescribed" in data[m]:
+            acceleration, mass = self._with_given_motion(data, m, acceleration, mass)
         if is_wanted() and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
             return self._moved_at_once(m, data, acceleration, params, mass, with_stress)
         own = data[m].body_pos.new_empty(len(mass), 0) if params is None else params.to(data[m].body_pos.dtype)
@@ -136,6 +140,13 @@ class ElasticBodies(nn.Module):
         if with_stress:
             stress = (cauchy_stress(body_pos + way, law, cells) / self.stress_unit.to(device)).to(acceleration)
         return ((way - mean - gravity) / unit).to(acceleration), at_end.to(mass.device), stress
+
+    def _with_given_motion(self, data: HeteroData, m: str, acceleration: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """Return accelerations and masses with which prescribed nodes keep their velocity in the frame. The graph has the one that takes them where they go."""
+        prescribed = data[m].prescribed
+        gravity = data.gravity[data[m].batch] if "batch" in data[m] else data.gravity
+        still = (-gravity / self.acceleration_unit).to(acceleration)
+        return torch.where(prescribed[:, None], still, acceleration), torch.where(prescribed, HEAVY, mass)
 
     def _moved_at_once(
         self, m: str, data: HeteroData, acceleration: Tensor, params: Tensor | None, mass: Tensor, with_stress: bool

@@ -11,12 +11,14 @@ This is the smallest change in the mass-weighted sense for which Σ m a and Σ m
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Literal, cast
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch_geometric.data import HeteroData
 
 from gpe_pl.nn.fused import plain_gradients, works_on
 from gpe_pl.nn.island_momentum_kernels import remove_rigid_part, replace_rigid_part
@@ -24,6 +26,21 @@ from gpe_pl.nn.island_momentum_kernels import remove_rigid_part, replace_rigid_p
 IslandMomentum = Literal["ignored", "linear", "angular"]
 SMALLEST_PRINCIPAL_FRACTION = 1e-4
 """Fraction of the largest principal moment of inertia below which an island has no defined rotation about an axis (a single node, nodes in a row)."""
+
+
+def joined(parts: list[Tensor]) -> Tensor:
+    """Return tensors joined along their first axis."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def grouped(data: HeteroData, materials: Iterable[str], name: str, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return mass, position and group (``island`` or ``body``) of the nodes of these materials; graphs of a batch number groups from 0; −1: no group."""
+    stores = [data[m] for m in materials]
+    if len(stores) == 1 and "batch" not in stores[0]:
+        return stores[0].mass, stores[0].pos, stores[0][name]
+    start = torch.cumsum(count, dim=0) - count
+    group = torch.cat([torch.where(s[name] < 0, s[name], s[name] + start[s.batch]) if "batch" in s else s[name] for s in stores])
+    return torch.cat([s.mass for s in stores]), torch.cat([s.pos for s in stores]), group
 
 
 def conserve(

@@ -5,6 +5,7 @@ Each access by ``data[key].name`` takes microseconds, and a model reads some fif
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from torch import Tensor
@@ -18,3 +19,8 @@ def contents(data: HeteroData) -> tuple[dict[str, dict[str, Tensor]], dict[EdgeT
     nodes: dict[Any, Any] = data._node_store_dict
     edges: dict[Any, Any] = data._edge_store_dict
     return {t: store._mapping for t, store in nodes.items()}, {r: store._mapping for r, store in edges.items()}
+
+
+def predicted_rows(store: Mapping[str, Any], values: Tensor) -> Tensor:
+    """Return the values [node, …] of those nodes of a store that a model has to predict: nodes whose motion is given are left out."""
+    return values[~store["prescribed"]] if "prescribed" in store else values

@@ -255,6 +255,7 @@ class _Recording:
         self.motion: list[BoundaryMotion] = []
         self.ids: list[np.ndarray] = []
         self.entered: list[State] = []
+        self.force: list[np.ndarray] = []
         self.termination: Termination | None = None
         self.add(start.state)
 
@@ -270,6 +271,8 @@ class _Recording:
             self.motion.append(BoundaryMotion(*(np.array(_numpy(x)) for x in (b.pos, b.vel, b.normal))))
         if item.node_id is not None:
             self._note_identities(item)
+        if item.loads is not None and item.loads.force is not None:
+            self.force.append(np.array(item.loads.force[0]))
         self.stress.append(None if item.stress is None else Stress(_numpy(item.stress.node), _numpy(item.stress.cell)))
 
     def _note_identities(self, state: State) -> None:
@@ -316,6 +319,8 @@ class _Recording:
             cells=None if state.cells is None else _numpy(state.cells),
             cell_dim=state.cell_dim,
             rigid_body=None if state.rigid_body is None else _numpy(state.rigid_body),
+            prescribed=None if state.loads is None or not state.loads.prescribed.any() else state.loads.prescribed,
+            force=np.stack(self.force) if self.force else None,
             stress=Stress(np.stack([s.node for s in known]), np.stack([s.cell for s in known])) if has_stress else None,
             termination=self.termination,
             alive=alive,

@@ -25,6 +25,8 @@ def check_surroundings(state: State, solver: str, computes_open_scenes: bool = F
         raise SimulationError(f"{solver} does not compute periodic domains; the scene repeats along {axes}", reason="input")
     if state.openings and not computes_open_scenes:
         raise SimulationError(f"{solver} does not compute scenes with inlets and outlets; FLIP and MPM do", reason="input")
+    if state.loads is not None:
+        raise SimulationError(f"{solver} computes neither prescribed nodes nor nodal forces; the scene has some", reason="input")
     b = state.boundary
     if _moves(b) or np.any(np.asarray(b.restitution) != 0):
         raise SimulationError(f"{solver} supports only boundaries at rest and without restitution", reason="input")

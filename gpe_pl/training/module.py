@@ -23,6 +23,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE
 from gpe_pl.models.base import Prediction
+from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.system import ranks
 from gpe_pl.system.machine import has_cpp_compiler
 from gpe_pl.training.loss_terms import LEAST_ERROR, Loss, num_neighbors, penalty
@@ -63,8 +64,8 @@ class TrainingError(GpeError, RuntimeError):
 class TrainingModule(L.LightningModule):
     """Trains a ``LearnedSimulator`` on accelerations.
 
-    By default, the loss is the mean squared error of the normalised acceleration over all dynamic nodes and axes. For a fixed frame interval this is, up to a
-    constant, the paper's MSE of the next position.
+    By default, the loss is the mean squared error of the normalised acceleration over axes and all dynamic nodes whose motion is not given. For a fixed frame
+    interval this is, up to a constant, the paper's MSE of the next position.
 
     Args:
         simulator: simulator with its statistics set.
@@ -206,11 +207,13 @@ class TrainingModule(L.LightningModule):
         std = self.simulator.stress_std.to(self.simulator.builder.precision)
         acceleration = [self._penalty(a - self._normalized(batch[m].target)) for m, a in predicted.acceleration.items()]
         stress = [(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]
+        stores = [batch[m] for m in predicted.acceleration]
         if self.neighbor_weight is not None:
             acceleration = self._weighted_by_neighbors(batch, predicted.acceleration, acceleration)
         if "weight" in batch:
             acceleration = self._weighted(batch, predicted.acceleration, acceleration)
             stress = self._weighted(batch, predicted.stress, stress)
+        acceleration = [predicted_rows(store, error) for store, error in zip(stores, acceleration, strict=True)]
         fractions = self._fractions(acceleration, stress)
         loss = torch.cat(acceleration).mean() * fractions[0]
         if stress:
@@ -294,7 +297,8 @@ class TrainingModule(L.LightningModule):
     def validation_step(self, batch: HeteroData, batch_idx: int) -> None:
         predicted = self.simulator(batch).acceleration
         for material, value in predicted.items():
-            self.val_nmse.update(value, self._normalized(batch[material].target))
+            own, target = (predicted_rows(batch[material], v) for v in (value, self._normalized(batch[material].target)))
+            self.val_nmse.update(own, target)
 
     def on_validation_start(self) -> None:
         self._excursions.clear()  # they were made with older weights; and the checkpoints that follow stay small

@@ -97,9 +97,11 @@ class Excursions:
             under_way = self._taken_up(lane, starts) or Excursion(samples, *unrolled(simulator, starts), [])
         topologies = []
         for k, start in enumerate(starts):
-            if start.state.boundary.motion is not None:  # this start's stretch of the motion may reach further than the last
-                boundary = start.state.boundary.at(under_way.steps[k])
-                under_way.states[k] = replace(under_way.states[k], boundary=boundary)
+            step = under_way.steps[k]  # this start's stretch of given motion may reach further than the last
+            if start.state.boundary.motion is not None:
+                under_way.states[k] = replace(under_way.states[k], boundary=start.state.boundary.at(step))
+            if start.state.loads is not None:
+                under_way.states[k] = replace(under_way.states[k], loads=start.state.loads.at(step))
             is_over = under_way.steps[k] > start.num_steps
             found = None if is_over else simulator.builder.topology_or_error(under_way.states[k])
             if not isinstance(found, Topology):

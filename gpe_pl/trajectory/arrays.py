@@ -91,13 +91,13 @@ def positive(name: str, value: Any, unit: str) -> float:
     raise ArrayError(f"{name}={value!r}: must be a positive number of {unit}")
 
 
-def flags(name: str, values: Any, count: int) -> tuple[bool, ...]:
-    """Return ``count`` truth values, one per axis; None stands for all false. Raise ``ArrayError`` for other values."""
+def flags(name: str, values: Any, count: int, each: str = "axes") -> tuple[bool, ...]:
+    """Return ``count`` truth values, one for each axis or for each of what ``each`` names; None stands for all false. Raise ``ArrayError`` for other values."""
     if values is None:
         return (False,) * count
     array = np.asarray(values)
     if array.shape != (count,) or not (array.dtype == bool or (array.dtype.kind in "iu" and np.isin(array, (0, 1)).all())):
-        raise ArrayError(f"{name}={array.tolist()!r:.80}: needs true or false for each of {count} axes")
+        raise ArrayError(f"{name}={array.tolist()!r:.80}: needs true or false for each of {count} {each}")
     return tuple(array.astype(bool).tolist())
 
 
@@ -201,6 +201,39 @@ def checked_bodies(rigid_body: Any, num_nodes: int) -> np.ndarray:
         node = int((array < -1).argmax())
         raise ArrayError(f"rigid_body: node {node} is {array[node]}, must be -1 or the number of a body")
     return array.astype(np.int32)
+
+
+def checked_prescribed(prescribed: Any, num_nodes: int, rigid_body: np.ndarray | None) -> np.ndarray:
+    """Return a mask [node] of the nodes whose motion is given.
+
+    Raises:
+        ArrayError: the values are no truth values, one per node; all nodes are prescribed; or a node of a rigid body is.
+    """
+    mask = np.array(flags("prescribed", prescribed, num_nodes, "nodes"))
+    if mask.all():
+        raise ArrayError("prescribed: the motion of all nodes is given, so there is nothing to compute; leave some nodes free")
+    if rigid_body is not None and (mask & (rigid_body >= 0)).any():
+        node = int((mask & (rigid_body >= 0)).argmax())
+        raise ArrayError(
+            f"prescribed: node {node} belongs to rigid body {rigid_body[node]}, whose motion is computed as a whole; "
+            "give a rigid body with known motion as boundary=Boundary.moving(…)"
+        )
+    return mask
+
+
+def checked_force(force: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return forces on nodes [frame, node, dim] in N, given those of each frame, or forces that never change [node, dim].
+
+    Args:
+        force: the forces.
+        shape: shape of the positions [frame, node, dim].
+
+    Raises:
+        ArrayError: the array has another shape, or a number is not finite.
+    """
+    if np.shape(force) == shape[1:]:
+        force = np.broadcast_to(np.asarray(force), shape)
+    return numbers("force", force, dict(zip(("frame", "node", "dim"), shape, strict=True))).astype(np.float32)
 
 
 def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, int]:

@@ -16,6 +16,8 @@ GROUP: Kind = {"kind": "group"}
 """The field has one row per node. Its values are numbers of groups of nodes, −1 for none."""
 SCENE: Kind = {"kind": "scene"}
 """The field has one value for the whole scene."""
+PARTS: Kind = {"kind": "parts"}
+"""The field is an object with values of nodes and of later frames, such as ``loads.Loads``. It has ``take``, ``joined`` and ``at`` of its own."""
 STEP: Kind = {"kind": "step"}
 """The field describes the step that led to a state, or is memory of a simulator for its next step. It needs a default value, which means unknown."""
 

@@ -44,7 +44,9 @@ class Isometry(Protocol):
 
     def state(self, state: State, boundary: Boundary) -> State:
         """Return the image of a state, given that of its boundary. ``periodicity`` and ``internal`` stay as they are."""
-        history, rest_pos, stress = state.velocity_history, state.rest_pos, state.stress
+        history, rest_pos, stress, loads = state.velocity_history, state.rest_pos, state.stress, state.loads
+        if loads is not None:
+            loads = replace(loads, path=self.point(loads.path), force=None if loads.force is None else self.vector(loads.force))
         return replace(
             state,
             pos=self.point(state.pos),
@@ -55,6 +57,7 @@ class Isometry(Protocol):
             gravity=self.vector(state.gravity),
             stress=None if stress is None else self._stress(stress),
             boundary=boundary,
+            loads=loads,
         )
 
     def trajectory(self, trajectory: Trajectory) -> Trajectory:
@@ -67,6 +70,7 @@ class Isometry(Protocol):
             rest_pos=None if rest_pos is None else self.point(rest_pos),
             stress=None if stress is None else self._stress(stress),
             boundary=self.boundary(trajectory.boundary),
+            force=None if trajectory.force is None else self.vector(trajectory.force),
         )
 
     def _stress(self, stress: Stress) -> Stress:

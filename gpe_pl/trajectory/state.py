@@ -13,7 +13,8 @@ from array_api_compat import array_namespace, device
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.trajectory.arrays import ArrayError
 from gpe_pl.trajectory.boundary import Array, Boundary
-from gpe_pl.trajectory.kinds import CELL, GROUP, NODE, SCENE, STEP, names_of
+from gpe_pl.trajectory.kinds import CELL, GROUP, NODE, PARTS, SCENE, STEP, names_of
+from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.openings import Opening
 
 
@@ -86,6 +87,7 @@ class State:
         openings: inlets and outlets. The arrays of a state have the nodes that are in the scene now, so their number changes in an open scene.
         node_id: identities of the nodes [node], ascending, which stay the same while nodes enter and leave; None in scenes that are not open.
         next_id: identity of the next node that enters.
+        loads: nodes whose motion is given, and forces on nodes; None if the scene has neither.
     """
 
     pos: Array = field(metadata=NODE)
@@ -113,6 +115,7 @@ class State:
     openings: tuple[Opening, ...] = field(default=(), metadata=SCENE)
     node_id: Array | None = field(default=None, metadata=NODE)
     next_id: int = field(default=0, metadata=SCENE)
+    loads: Loads | None = field(default=None, metadata=PARTS)
 
     @property
     def num_nodes(self) -> int:
@@ -153,6 +156,9 @@ class State:
                 number[rows] = xp.arange(rows.shape[0], dtype=xp.int64, device=device(self.pos))
                 cells = number[cells]
                 values[name] = cells[xp.all(cells >= 0, axis=1)]
+        for name in names_of(self, PARTS):
+            if (part := getattr(self, name)) is not None:
+                values[name] = part.take(rows)
         return replace(self, **values, **_nothing_known(self))
 
     @staticmethod
@@ -164,7 +170,7 @@ class State:
         Raises:
             ArrayError: some of the states have a field that others lack.
         """
-        first, values = states[0], dict[str, Array]()
+        first, values = states[0], dict[str, Any]()
         xp = array_namespace(first.pos)
         starts = [0, *accumulate(state.num_nodes for state in states)]
         for name in (*names_of(first, NODE), *names_of(first, GROUP), *names_of(first, CELL)):
@@ -179,13 +185,15 @@ class State:
             if name in names_of(first, GROUP):  # groups are numbered on
                 parts = [xp.where(part >= 0, part + start, part) for part, start in zip(parts, _first_numbers(parts), strict=True)]
             values[name] = xp.concat(parts)
+        for name in names_of(first, PARTS):
+            values[name] = Loads.joined([getattr(state, name) for state in states], [state.num_nodes for state in states])
         return replace(first, **values, **_nothing_known(first))
 
     def later(self, dt: float, pos: Array, vel: Array, **values: Any) -> State:
         """Return the state one frame later.
 
-        The new velocity is appended to the velocity history, if there is one, and the oldest is dropped. A moving boundary advances by a frame. Fields of kind
-        ``STEP`` get their defaults.
+        The new velocity is appended to the velocity history, if there is one, and the oldest is dropped. A moving boundary advances by a frame. Nodes whose
+        motion is given (``loads``) get their given positions instead of those in ``pos``. Fields of kind ``STEP`` get their defaults.
 
         Args:
             dt: frame interval [s].
@@ -193,6 +201,8 @@ class State:
             vel: velocities [node, dim] in m/s.
             values: other fields, by name.
         """
+        if self.loads is not None:
+            pos, vel, values = self._with_given_motion(self.loads, dt, pos, vel, values)
         if self.velocity_history is not None and "velocity_history" not in values:
             xp = array_namespace(vel)
             values["velocity_history"] = xp.concat([self.velocity_history[:, 1:], vel[:, None]], axis=1)
@@ -205,9 +215,28 @@ class State:
         }
         return replace(self, pos=self.periodicity.wrapped(pos), vel=vel, **known)
 
+    def _with_given_motion(
+        self, loads: Loads, dt: float, pos: Array, vel: Array, values: dict[str, Any]
+    ) -> tuple[Array, Array, dict[str, Any]]:
+        """Return the arguments of ``later`` in which prescribed nodes move as given, and their loads advance by a frame."""
+        pos = loads.moved(pos)
+        given = self.periodicity.shortest(pos - self.pos) / dt
+        vel, values = loads.at_prescribed(given, vel), {**values, "loads": loads.at(1)}
+        if values.get("velocity_history") is not None:
+            past = values["velocity_history"]
+            values["velocity_history"] = array_namespace(past).concat([past[:, :-1], vel[:, None]], axis=1)
+        if values.get("frame_velocity") is not None:
+            values["frame_velocity"] = loads.at_prescribed(given, values["frame_velocity"])
+        return pos, vel, values
+
     def corrected(self, pos: Array, vel: Array) -> State:
-        """Return the same instant with other positions [m] and velocities [m/s]; the last velocity of the history changes with them."""
+        """Return the same instant with other positions [m] and velocities [m/s]; the last velocity of the history changes with them.
+
+        Nodes whose motion is given stay as they are.
+        """
         history = self.velocity_history
+        if self.loads is not None:
+            pos, vel = self.loads.at_prescribed(self.pos, pos), self.loads.at_prescribed(self.vel, vel)
         if history is not None:
             history = array_namespace(vel).concat([history[:, :-1], vel[:, None]], axis=1)
         at_frame = None if self.frame_velocity is None else self.frame_velocity + (vel - self.vel)

@@ -70,6 +70,8 @@ def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
         "rest_pos": trajectory.rest_pos,
         "alive": trajectory.alive,
         "rigid_body": trajectory.rigid_body,
+        "prescribed": trajectory.prescribed,
+        "force": trajectory.force,
         "cells": trajectory.cells,
         "cell_dim": None if trajectory.cells is None or trajectory.cell_dim is None else [trajectory.cell_dim],
     }
@@ -100,7 +102,7 @@ FURTHER = (START_TIME, OPENINGS)
 """Attributes that some trajectories have, and that the digest covers."""
 
 
-OPTIONAL = ("stress_materials",)
+OPTIONAL = ("stress_materials", "loads")
 """Metadata that are stored only if they are not None."""
 
 
@@ -421,6 +423,8 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         boundary,
         rest_pos=arrays.get("rest_pos"),
         rigid_body=arrays.get("rigid_body"),
+        prescribed=arrays["prescribed"].astype(bool) if "prescribed" in arrays else None,
+        force=arrays.get("force"),
         cells=arrays.get("cells"),
         cell_dim=int(arrays["cell_dim"][0]) if "cell_dim" in arrays else None,
         stress=Stress(arrays["node_stress"], arrays["cell_stress"]) if "node_stress" in arrays else None,

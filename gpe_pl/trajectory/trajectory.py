@@ -12,7 +12,7 @@ import numpy as np
 
 from gpe_pl.geometry.periodicity import Periodicity, PeriodicityError
 from gpe_pl.geometry.shape_values import moved
-from gpe_pl.schema import BOUNDARY, MATERIALS, MaterialParameter, node_code, param_names, stored_parameters
+from gpe_pl.schema import BOUNDARY, LOADS, MATERIALS, MaterialParameter, node_code, param_names, stored_parameters
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.arrays import (
     RADIUS_SPACINGS,
@@ -20,7 +20,9 @@ from gpe_pl.trajectory.arrays import (
     checked_bodies,
     checked_bounds,
     checked_cells,
+    checked_force,
     checked_materials,
+    checked_prescribed,
     flags,
     numbers,
     per_node,
@@ -31,6 +33,7 @@ from gpe_pl.trajectory.arrays import (
 from gpe_pl.trajectory.boundary import Array, Boundary, check_steps
 from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.living import living
+from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State, Stress
 
@@ -56,6 +59,7 @@ class Metadata:
             ``interpolated``.
         solver, solver_version, config: provenance; ``config`` is JSON.
         stress_materials: materials whose nodes have a stress; None stands for ``solid``, the material of the FEM solver.
+        loads: loads that occur anywhere in the data set, names of ``schema.LOADS``; they fix features of its graphs. None stands for none.
     """
 
     dataset: str
@@ -75,12 +79,14 @@ class Metadata:
     solver_version: str = ""
     config: str = "{}"
     stress_materials: tuple[str, ...] | None = None
+    loads: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "materials", tuple(self.materials))
         object.__setattr__(self, "param_names", tuple(self.param_names))
         if self.stress_materials is not None:
             object.__setattr__(self, "stress_materials", tuple(self.stress_materials))
+        object.__setattr__(self, "loads", tuple(self.loads or ()) or None)
         object.__setattr__(self, "bounds", tuple((float(a), float(b)) for a, b in self.bounds))
         object.__setattr__(self, "gravity", tuple(float(g) for g in self.gravity))
         object.__setattr__(self, "periodic", tuple(bool(p) for p in self.periodic) or (False,) * len(self.bounds))
@@ -128,6 +134,8 @@ class Metadata:
             first, every = param_names(self.materials), param_names(self.materials, (p.name for m in self.materials for p in MATERIALS[m]))
             also = f" and possibly more, in the order {every}" if every != first else ""
             yield "param_names", f"is {self.param_names}, expected {first} for {self.materials}{also}"
+        if self.loads is not None and self.loads != tuple(name for name in LOADS if name in self.loads):
+            yield "loads", f"is {self.loads}, expected names among {', '.join(LOADS)} in this order"
         for key in ("frame_dt", "spacing", "connectivity_radius"):
             if not 0 < getattr(self, key) < math.inf:
                 yield key, f"is {getattr(self, key)}, must be positive"
@@ -202,6 +210,8 @@ class Trajectory:
         alive: mask [frame, node] of the nodes that are in an open scene; None if all are in it in every frame. A node enters and leaves at most once, so its
             number is its identity. Before and after, its position and velocity are those of the nearest frame in which it is in the scene.
         openings: inlets and outlets of an open scene.
+        prescribed: whether the motion of each node is given [node]; ``pos`` has it. None if no motion is given.
+        force: forces on nodes from each frame to the next [frame, node, dim] in N; None if there are none.
         termination: reason why a rollout stopped early; None if it did not.
         start_time: time of the first frame since the start of the scene [s].
         is_prediction: whether the trajectory is a rollout of a simulator other than a ground-truth solver.
@@ -221,6 +231,8 @@ class Trajectory:
     rigid_body: np.ndarray | None = None
     alive: np.ndarray | None = None
     openings: tuple[Opening, ...] = ()
+    prescribed: np.ndarray | None = None
+    force: np.ndarray | None = None
     termination: Termination | None = field(default=None, compare=False)
     start_time: float = field(default=0.0, compare=False)
     is_prediction: bool = field(default=False, compare=False)
@@ -245,6 +257,8 @@ class Trajectory:
         rest_pos: Array | None = None,
         rigid_body: Array | None = None,
         stress: Array | None = None,
+        prescribed: Array | None = None,
+        force: Array | None = None,
         dataset: str = "arrays",
         split: str = "train",
     ) -> Trajectory:
@@ -276,6 +290,10 @@ class Trajectory:
             rigid_body: number of the rigid body that each node belongs to [node], −1 for none. Simulators move the nodes of a body by one rigid motion.
             stress: Cauchy stress at the nodes [frame, node, component] in Pa, with the components of ``State.stress``. Models can learn it
                 (``model.stress=true``). Give a material without a stress zeros; it counts as having none.
+            prescribed: whether the motion of each node is given [node], as that of clamped nodes and of nodes that a machine moves. ``pos`` has their
+                positions in all frames. Simulators take these positions, and compute those of the other nodes.
+            force: forces on nodes from each frame to the next [frame, node, dim] in N, or forces that never change [node, dim]. Distribute tractions to the
+                nodes as your finite-element program does. Gravity is not among them, and forces on prescribed nodes have no effect.
             dataset, split: names of data set and split; ``save_dataset`` overrides both.
 
         Raises:
@@ -315,11 +333,19 @@ class Trajectory:
         elif rest_pos is not None:
             raise ArrayError("rest_pos: only meshes have rest positions; pass cells too, or leave it out")
         known = None if stress is None else checked_stress(stress, pos, cells)
+        if rigid_body is not None:
+            rigid_body = checked_bodies(rigid_body, num_nodes)
+        if prescribed is not None:
+            prescribed = checked_prescribed(prescribed, num_nodes, rigid_body)
+        if force is not None:
+            force = checked_force(force, pos.shape)
+        loads = tuple(name for name, given in zip(LOADS, (prescribed, force), strict=True) if given is not None and given.any())
         return cls(
             Metadata(
                 dataset, names, stored, frame_dt, spacing, radius, bounds, tuple(map(float, gravity)),
                 periodicity.periodic, split=split, solver="import", solver_version="1",
                 stress_materials=() if known is None else tuple(m for m in names if known.node[:, codes == node_code(m)].any()),
+                loads=loads,
             ),
             pos,
             numbers("vel", vel, shape).astype(np.float32, copy=False),
@@ -331,7 +357,9 @@ class Trajectory:
             cells=cells,
             stress=known,
             cell_dim=cell_dim,
-            rigid_body=None if rigid_body is None else checked_bodies(rigid_body, num_nodes),
+            rigid_body=rigid_body,
+            prescribed=prescribed if "motion" in loads else None,
+            force=force if "force" in loads else None,
         )  # fmt: skip
 
     @property
@@ -341,6 +369,18 @@ class Trajectory:
     @property
     def num_nodes(self) -> int:
         return self.pos.shape[1]
+
+    @property
+    def is_predicted(self) -> np.ndarray:
+        """Mask [node] of the nodes that simulators compute: those whose motion is not given."""
+        return np.ones(self.num_nodes, bool) if self.prescribed is None else ~self.prescribed
+
+    def loads_at(self, frame: int) -> Loads | None:
+        """Return the loads from a frame on; None if there are none."""
+        if self.prescribed is None and self.force is None:
+            return None
+        prescribed = ~self.is_predicted
+        return Loads(prescribed, self.pos[frame:, prescribed], None if self.force is None else self.force[frame:])
 
     def state(self, frame: int, history: int = 0) -> State:
         """Return the state at a frame.
@@ -368,6 +408,7 @@ class Trajectory:
             pos, vel, self.node_type, self.mass, self.material_params, self.boundary.at(frame), gravity, past,
             self.start_time + frame * self.metadata.frame_dt, rest_pos, self.cells, stress, self.cell_dim, periodicity=self.metadata.periodicity,
             param_names=self.metadata.param_names, frame_velocity=at_frame, rigid_body=self.rigid_body,
+            loads=self.loads_at(frame),
         )  # fmt: skip
         return state if self.alive is None else living(state, self.alive[: frame + 1], self.vel[: frame + 1], self.openings)
 
@@ -402,13 +443,14 @@ class Trajectory:
             boundary=self.boundary.at(start, stop),
             stress=stress,
             alive=None if self.alive is None else self.alive[start:stop],
+            force=None if self.force is None else self.force[start:stop],
             start_time=self.start_time + first * self.metadata.frame_dt,
         ).present()
 
     def every(self, stride: int) -> Trajectory:
         """Return every ``stride``-th frame, from the first on, as a trajectory whose frames are ``stride`` times as long.
 
-        Velocities of nodes stay those at the frames. Boundary nodes get their mean velocities over the longer frames.
+        Velocities of nodes stay those at the frames. Boundary nodes get their mean velocities over the longer frames, and forces are averaged, too.
         """
         if stride == 1:
             return self
@@ -421,6 +463,7 @@ class Trajectory:
             boundary=self.boundary.every(stride),
             stress=None if self.stress is None else Stress(self.stress.node[::stride], self.stress.cell[::stride]),
             alive=None if self.alive is None else self.alive[::stride],
+            force=None if self.force is None else _mean_over(self.force, stride),
             termination=None if stop is None else replace(stop, frame=-(-stop.frame // stride)),
         ).present()
 
@@ -433,12 +476,14 @@ class Trajectory:
 
     def of_nodes(self, nodes: np.ndarray) -> Trajectory:
         """Return some of the nodes, given by a mask [node], of a trajectory without mesh."""
-        per_node = {"node_type": self.node_type, "mass": self.mass, "material_params": self.material_params, "rigid_body": self.rigid_body}
+        names = ("node_type", "mass", "material_params", "rigid_body", "prescribed")
+        per_node = {name: getattr(self, name) for name in names}
         return replace(
             self,
             pos=self.pos[:, nodes],
             vel=self.vel[:, nodes],
             alive=None if self.alive is None else self.alive[:, nodes],
+            force=None if self.force is None else self.force[:, nodes],
             **{name: values[nodes] for name, values in per_node.items() if values is not None},
         )
 
@@ -497,4 +542,14 @@ class Trajectory:
             stress=stress,
             rigid_body=None if self.rigid_body is None else extended(self.rigid_body, -1),
             alive=None if self.alive is None else np.pad(self.alive, ((0, 0), (0, count)), constant_values=True),
+            prescribed=None if self.prescribed is None else extended(self.prescribed, True),
+            force=None if self.force is None else np.pad(self.force, ((0, 0), (0, count), (0, 0))),
         )
+
+
+def _mean_over(values: np.ndarray, stride: int) -> np.ndarray:
+    """Return the means of values [frame, …] over ``stride`` frames each; the last mean may be over fewer."""
+    first = np.arange(0, len(values), stride)
+    count = np.minimum(first + stride, len(values)) - first
+    total = np.add.reduceat(values.astype(np.float64), first, axis=0)
+    return (total / count.reshape(-1, *[1] * (values.ndim - 1))).astype(values.dtype)

@@ -58,12 +58,14 @@ KEYS = (
         "rest_pos",
         "rigid_body",
         "stress",
+        "prescribed",
+        "force",
     ),
     *(f"boundary_{name}" for name in ("pos", "normal", "vel", "friction", "restitution")),
 )
 PREFIXES = ("params_", "cells_")
 """Prefixes of keys, followed by a material or a kind of cells."""
-PER_NODE = ("frame_dt", "materials", "mass", "bounds", "periodic", "gravity", "spacing", "connectivity_radius")
+PER_NODE = ("frame_dt", "materials", "mass", "bounds", "periodic", "gravity", "spacing", "connectivity_radius", "prescribed")
 """Keys with at most one value per node, or ``FEW`` values for the scene. Keys that begin with ``params_`` belong to them too."""
 FEW = 6
 """Maximum number of values that describe a scene."""

@@ -26,7 +26,7 @@ from gpe_pl.files import sealed
 from gpe_pl.files.atomic import free_bytes, replacing
 from gpe_pl.files.names import NameRefused, data_name
 from gpe_pl.geometry.periodicity import PeriodicityError
-from gpe_pl.schema import HISTORY, MATERIALS, NODE_TYPES, SPLITS, ParameterGroup, node_code, param_names, stored_parameters
+from gpe_pl.schema import HISTORY, LOADS, MATERIALS, NODE_TYPES, SPLITS, ParameterGroup, node_code, param_names, stored_parameters
 from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
 from gpe_pl.trajectory.arrays import ArrayError, nearest_distances
@@ -182,6 +182,7 @@ class _Survey:
         materials: materials of all trajectories.
         columns: names of the parameters of all trajectories.
         stressed: materials with a stress in any trajectory.
+        loads: loads that any trajectory has.
         bounds: bounds of each trajectory, ``(low, high)`` per axis [m].
         spacings, distances, radii: spacing, median distance to the nearest node, and connectivity radius of each sampled trajectory [m].
         velocity_ratios: mean displacement over mean velocity × frame interval, of each sampled trajectory.
@@ -198,6 +199,7 @@ class _Survey:
     materials: set[str] = field(default_factory=set)
     columns: set[str] = field(default_factory=set)
     stressed: set[str] = field(default_factory=set)
+    loads: set[str] = field(default_factory=set)
     bounds: list[tuple[tuple[float, float], ...]] = field(default_factory=list)
     spacings: list[float] = field(default_factory=list)
     distances: list[float] = field(default_factory=list)
@@ -315,6 +317,7 @@ class _Conversion:
             survey.suspects.append(Event(split, name, 0, what))
         survey.materials |= set(m.materials)
         survey.columns |= set(m.param_names)
+        survey.loads |= set(m.loads or ())
         survey.stressed |= set(m.with_stress if trajectory.stress is not None else ())
         survey.num_bytes += sum(array.nbytes for array in arrays.values())
         survey.bounds.append(m.bounds)
@@ -507,7 +510,8 @@ class _Conversion:
         if stressed and trajectory.stress is None:
             raise Refusal("has no stress, which other trajectories have; give it to all or to none")
         metadata = replace(
-            m, dataset=self.report.name, materials=materials, stress_materials=stressed, param_names=names, spacing=facts.spacing,
+            m, dataset=self.report.name, materials=materials, stress_materials=stressed, loads=tuple(name for name in LOADS if name in self.survey.loads),
+            param_names=names, spacing=facts.spacing,
             connectivity_radius=facts.connectivity_radius, split=split,
             parameter_group=self._parameter_group(columns, names) if split == "test_unseen" else "seen", solver=f"import/{self.about['format']}",
             solver_version=VERSION, config=json.dumps(self.about, sort_keys=True, default=str),

@@ -6,8 +6,9 @@ bytes) or ``.h5`` (a group per trajectory with a data set per field). ``meta.jso
 importer reads ``world_pos`` [frame, node, 3], ``mesh_pos`` [1, node, 2 or 3], ``cells`` [1, cell, corner] and ``node_type`` [1, node, 1]. Cells of four corners
 are quadrilaterals if ``mesh_pos`` has only two components, or lies in a plane normal to an axis. Otherwise they are tetrahedra.
 
-Types are 0 normal, 1 obstacle, 3 handle and 6 wall. Normal nodes become an ``elastomer``. The others become boundary nodes, still or moving as in the source.
-Cells with boundary nodes are left out; the connectivity radius connects a handle to its cloth. Data without ``world_pos`` (``cylinder_flow``, ``airfoil``) are
+Types are 0 normal, 1 obstacle, 3 handle and 6 wall. Normal nodes become an ``elastomer``. Handles become nodes of the same mesh whose motion is given.
+Obstacles and walls become boundary nodes, still or moving as in the source, and cells with boundary nodes are left out. ``materials={3: boundary}`` makes
+handles boundary nodes, too. Data without ``world_pos`` (``cylinder_flow``, ``airfoil``) are
 fields on a still mesh and are refused, because their nodes have no trajectory. The ``stress`` of a source is the von Mises stress only. It does not determine
 the stress tensor and is left out.
 
@@ -39,8 +40,10 @@ from gpe_pl.data.importers.source import (
     split_files,
     typed,
 )
+from gpe_pl.schema import BOUNDARY
 
-TYPES = {0: "elastomer", 1: "boundary", 3: "boundary", 6: "boundary"}
+NORMAL, HANDLE = 0, 3
+TYPES = {NORMAL: "elastomer", 1: "boundary", HANDLE: "elastomer", 6: "boundary"}
 NEEDED = ("world_pos", "mesh_pos", "cells", "node_type")
 
 
@@ -150,4 +153,10 @@ def _loaded(fields: Mapping[str, np.ndarray], length: int, settings: ImportSetti
     kind = ({3: "triangle", 4: "quadrilateral"} if is_sheet else {4: "tetrahedron", 8: "hexahedron"}).get(cells.shape[2])
     if kind is None:
         raise Refusal(f"cells have {cells.shape[2]} corners, which no kind of cell {'of a sheet ' if is_sheet else ''}has")
-    return build(typed(pos, types[0, :, 0], TYPES, settings, cells={kind: cells[0]}, rest_pos=flat, warnings=warnings), facts)
+    table = TYPES | {HANDLE: (settings.materials or {}).get(NORMAL, TYPES[NORMAL])}
+    nodes = typed(pos, types[0, :, 0], table, settings, cells={kind: cells[0]}, rest_pos=flat, warnings=warnings)
+    handles = (types[0, :, 0] == HANDLE) & (nodes.kind != BOUNDARY)
+    if handles.any():
+        nodes.prescribed = handles
+        nodes.notes.append(f"the motion of nodes of type {HANDLE} is given (prescribed nodes)")
+    return build(nodes, facts)

@@ -54,6 +54,5 @@ def free_flight_of(trajectory: Trajectory, facts: Facts) -> FreeFlight:
     if facts.bounds is None:
         b = with_walls(m.dim, b, walls_at_bounds(replace(facts, bounds=m.bounds, spacing=m.spacing), m.dim))
     arrays = {"pos": trajectory.pos, "mass": trajectory.mass, "boundary_pos": b.pos[None] if b.motion is None else b.motion.pos}
-    if trajectory.cells is not None:
-        arrays["cells"] = trajectory.cells
+    arrays |= {name: values for name in ("cells", "prescribed", "force") if (values := getattr(trajectory, name)) is not None}
     return joined(free_flights(trajectory.metadata, arrays, FLIGHT_FRAMES), trajectory.metadata.dim)

@@ -241,6 +241,9 @@ class Nodes:
         cells: cells of a mesh by kind [cell, corner].
         rest_pos: rest positions of a mesh [node, dim] in m.
         rigid_body: number of the rigid body of each node, −1 for none [node].
+        prescribed: whether the motion of each node is given [node].
+        force: forces on nodes [frame, node, dim] in N.
+        stress: Cauchy stress at nodes [frame, node, component] in Pa.
         moving_walls: positions and normals [frame, boundary_node, dim] of additional boundary nodes that move in a prescribed way.
         friction: friction coefficient of boundary nodes.
         repairs, notes, warnings: as in ``Loaded``.
@@ -256,6 +259,9 @@ class Nodes:
     cells: Mapping[str, np.ndarray] | None = None
     rest_pos: np.ndarray | None = None
     rigid_body: np.ndarray | None = None
+    prescribed: np.ndarray | None = None
+    force: np.ndarray | None = None
+    stress: np.ndarray | None = None
     moving_walls: tuple[np.ndarray, np.ndarray] | None = None
     friction: float = ASSUMED_FRICTION
     repairs: list[Repair] = field(default_factory=list)
@@ -319,6 +325,9 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
             cells=cells,
             rest_pos=None if nodes.rest_pos is None or cells is None else nodes.rest_pos[moving],
             rigid_body=None if nodes.rigid_body is None else nodes.rigid_body[moving],
+            prescribed=None if nodes.prescribed is None else nodes.prescribed[moving],
+            force=None if nodes.force is None else nodes.force[:, moving],
+            stress=None if nodes.stress is None else nodes.stress[:, moving],
         ),
         (*repairs, *wall_repairs),
         (*notes, *wall_notes),

@@ -12,11 +12,11 @@ import torch
 from gpe_pl.geometry.periodicity import Periodicity
 from gpe_pl.trajectory.arrays import ArrayError
 from gpe_pl.trajectory.boundary import Boundary
-from gpe_pl.trajectory.kinds import CELL, GROUP, NODE, SCENE, STEP, names_of
+from gpe_pl.trajectory.kinds import CELL, GROUP, NODE, PARTS, SCENE, STEP, names_of
 from gpe_pl.trajectory.state import State, Stress
 from tests import scenes
 
-KINDS = (NODE, GROUP, CELL, SCENE, STEP)
+KINDS = (NODE, GROUP, CELL, SCENE, STEP, PARTS)
 
 
 @dataclass(frozen=True)

@@ -261,14 +261,17 @@ def test_positions_outside_a_periodic_domain_are_folded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("container", ["tfrecord", "h5"])
-def test_meshgraphnets(tmp_path: Path, container: str) -> None:
+@pytest.mark.parametrize("as_boundary", [True, False])
+def test_meshgraphnets(tmp_path: Path, container: str, as_boundary: bool) -> None:
     cloths = [sources.sheet(seed=k) for k in range(3)]
     sources.mgn_meta(tmp_path / "raw", cloths[0])
     for name, cloth in zip(SPLITS, cloths, strict=True):
         getattr(sources, f"mgn_{container}")(tmp_path / "raw" / f"{name}.{container}", [cloth])
-    report, stored = imported(tmp_path, tmp_path / "raw", "meshgraphnets")
+    report, stored = imported(tmp_path, tmp_path / "raw", "meshgraphnets", materials={3: "boundary"} if as_boundary else None)
     for (trajectory,), cloth in zip(stored.values(), cloths, strict=True):
-        moving = cloth["node_type"][0, :, 0] == 0
+        handles = cloth["node_type"][0, :, 0] == 3
+        moving = ~handles if as_boundary else handles | True
+        assert handles.any() and (trajectory.prescribed is None if as_boundary else (trajectory.prescribed == handles).all())
         assert_stored(trajectory, cloth["world_pos"][:, moving], 0.02)
         np.testing.assert_array_equal(trajectory.boundary.pos, cloth["world_pos"][0, ~moving])
         assert trajectory.cells is not None and trajectory.rest_pos is not None
@@ -278,7 +281,7 @@ def test_meshgraphnets(tmp_path: Path, container: str) -> None:
         np.testing.assert_array_equal(np.flatnonzero(moving)[trajectory.cells], cells)
         assert trajectory.cell_dim == 2
         assert trajectory.metadata.materials == ("elastomer",)
-    assert any("3 of 40 cells have boundary nodes" in event.what for event in report.repairs)
+    assert any("3 of 40 cells have boundary nodes" in event.what for event in report.repairs) == as_boundary
 
 
 def test_a_mesh_of_tetrahedra(tmp_path: Path) -> None:
@@ -318,7 +321,7 @@ def test_a_cloth_of_quadrilaterals(tmp_path: Path, axes: int) -> None:
 
 
 def test_a_plate_that_an_actuator_deforms(tmp_path: Path) -> None:
-    """An obstacle moves in a prescribed way and handles stand still, as in deforming_plate."""
+    """An obstacle moves as a boundary, and handles stand still as prescribed nodes of the mesh, as in deforming_plate."""
     points = np.argwhere(np.ones((4, 4, 2))).astype(float)
     cells, press = Delaunay(points + np.random.default_rng(0).uniform(-0.1, 0.1, points.shape)).simplices, np.linspace(0, 0.3, 8)
     kind = np.where(points[:, 0] == 0, 3, 0)
@@ -339,7 +342,9 @@ def test_a_plate_that_an_actuator_deforms(tmp_path: Path) -> None:
     report, stored = imported(tmp_path, tmp_path / "raw", "meshgraphnets", frame_dt=0.1)
     assert not report.refusals and any("4 boundary nodes move" in note for note in report.notes)
     for k, (trajectory,) in enumerate(stored.values()):
-        assert len(trajectory.boundary.pos) == 8 + 4
+        assert len(trajectory.boundary.pos) == 4
+        assert trajectory.prescribed is not None and trajectory.prescribed.tolist() == (kind == 3).tolist()
+        assert trajectory.cells is not None and len(trajectory.cells) == len(cells)
         for frame in (0, 3, 7):
             boundary = trajectory.state(frame).boundary
             lowered = obstacle * SPACING - [0, 0, SPACING * (1 + k) * press[frame]]
