@@ -51,6 +51,11 @@ class _Rest:
 
     count: Tensor
 
+    def of_rows(self, rows: np.ndarray) -> _Rest:
+        """Return the counts of other nodes, as ``rollout.flow.FollowsNodes``; nodes that are new or move with an opening have not been at rest."""
+        row = torch.from_numpy(rows).to(self.count.device)
+        return _Rest(torch.where(row >= 0, self.count[row.clamp(min=0)], 0))
+
 
 class Sleeping(Batched):
     """Simulator in which islands at rest sleep: their nodes keep their positions and are not computed.

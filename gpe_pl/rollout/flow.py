@@ -35,7 +35,7 @@ def through_openings(before: State, after: State) -> State:
     new, rows = _prescribed(before, after)
     pos = as_numpy(new.pos)
     leaves = np.any([opening.removes(pos) for opening in after.openings], axis=0)
-    known: dict[str, Any] = {"num_substeps": after.num_substeps, "num_corrected": after.num_corrected, "num_asleep": after.num_asleep}
+    known: dict[str, Any] = {name: getattr(after, name) for name in ("num_substeps", "num_corrected", "num_asleep", "lost_impulse")}
     if leaves.any():
         new, rows = replace(new.take(np.flatnonzero(~leaves)), **known), rows[~leaves]
     for opening in after.openings:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gpe_pl.errors import GpeError
 from gpe_pl.export.trajectories import write_npz
-from gpe_pl.metrics.open_scenes import entering, leaving
+from gpe_pl.metrics.open_scenes import entering, leaving, ledger
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.browser import open_page
 from gpe_pl.viz.captions import describe, heading, with_heading
@@ -49,8 +49,7 @@ class Film:
         for name, rollout in with_heading(self.first, self.others).items():
             line = f"{name}: {(rollout.num_frames - 1) * rollout.metadata.frame_dt:.3g} s in {rollout.num_frames - 1} frames, {rollout.num_nodes} nodes"
             if rollout.alive is not None:
-                entered, left = entering(rollout).sum(), leaving(rollout).sum()
-                line += f" in all, of which {entered} entered, {left} left and {rollout.alive[-1].sum()} are there at the end"
+                line += f" in all{_account(rollout)}"
             if rollout is not self.first and rollout.alive is None:
                 line += f"; distance from the {heading(self.first)} {self.distance(name):.3g} m (root mean square)"
             lines.append(line + (f"; stopped early, {rollout.termination.message}" if rollout.termination is not None else ""))
@@ -97,6 +96,19 @@ class Film:
         if not open_page(path):
             print(f"no browser here; open {path}")
         return path
+
+
+def _account(rollout: Trajectory) -> str:
+    """Describe what enters, leaves and stays in a rollout of an open scene. The second half shows whether a flow has become steady."""
+    entered, left, book = entering(rollout).sum(), leaving(rollout).sum(), ledger(rollout)
+    half = slice(rollout.num_frames // 2, None)
+    seconds = max(1, len(book.mass[half])) * rollout.metadata.frame_dt
+    unit = "kg" if rollout.metadata.dim == 3 else "kg/m"
+    rates = [
+        f"{mass[half].sum() / seconds:.4g} {unit}/s {verb}" for mass, verb in ((book.entered_mass, "enter"), (book.left_mass, "leave"))
+    ]
+    stays = f"{book.mass[half].mean():.4g} {unit} are there"
+    return f", {entered} entered, {left} left; in the second half {rates[0]}, {rates[1]} and {stays}"
 
 
 def check_type(path: Path) -> None:

@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from gpe_pl.geometry.shapes import Box
+from gpe_pl.learned.approximate import _Rest
 from gpe_pl.rollout.baselines import Ballistic, ConstantVelocity
 from gpe_pl.rollout.ensemble import Ensemble
+from gpe_pl.rollout.flow import through_openings
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Replay, SimulationError, rollout, steps
 from gpe_pl.schema import node_code
@@ -116,3 +118,11 @@ def test_the_guard_names_a_node_by_its_identity_and_follows_it_through_walls() -
 def test_an_ensemble_refuses_open_scenes() -> None:
     with pytest.raises(SimulationError, match="an ensemble cannot predict open scenes"):
         Ensemble((ConstantVelocity(DT), ConstantVelocity(DT))).step(channel(INLET))
+
+
+def test_nodes_that_were_at_rest_still_are_when_others_enter() -> None:
+    before = channel(replace(INLET, low=(-0.1, 0.0), high=(0.1, 0.3))).to_torch()
+    after = replace(ConstantVelocity(DT).step(before), internal=_Rest(torch.arange(6)))
+    new = through_openings(before, after)
+    assert isinstance(new.internal, _Rest)
+    assert new.internal.count.tolist() == [0, 0, 0, 3, 4, 5, 0, 0, 0]  # three move with the inlet, three are new

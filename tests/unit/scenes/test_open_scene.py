@@ -119,7 +119,10 @@ def test_a_model_predicts_what_enters_and_leaves(tmp_path: Path) -> None:
     assert rollout.alive is not None
     layers = round(0.1 * 3.0 / SPACING)
     assert rollout.num_nodes == 64 + 8 * layers
+    half = rollout.num_frames // 2
+    assert half == 10
     assert "152 entered, " in film.summary()
+    assert f"{1600 * SPACING**2 * rollout.alive[half:].sum(axis=1).mean():.4g} kg/m are there" in film.summary()
     assert (~rollout.alive[-1, :64]).sum() > 0
     assert (rollout.pos[rollout.alive][:, 1] > 0.8).all()
     path = tmp_path / "train" / "shard-00000.h5"

@@ -43,6 +43,8 @@ def inlet(height: float, speed: float = SPEED) -> Opening:
 def test_water_in_a_duct_moves_with_the_speed_of_the_inlet() -> None:
     solver, state, _ = duct(0.4, 1.2, 1.0, inlet(0.4), Opening((1.0, 0.0), (1.2, 0.4), "x_high"))
     slow = replace(state, vel=0.25 * state.vel)  # the inlet has to accelerate all the water at once
+    inside, after = inlet(0.4).contains(state.pos), solver.step(slow)
+    np.testing.assert_allclose(after.pos[inside], state.pos[inside] + [DT * SPEED, 0.0], atol=1e-12)
     *_, last = steps(solver, slow, 4)
     beyond = last.pos[:, 0] > 0.2
     np.testing.assert_allclose(last.vel[beyond].mean(axis=0), [SPEED, 0.0], atol=0.02)
