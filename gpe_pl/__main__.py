@@ -18,6 +18,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "fit": ("fit", "train a model, evaluate it and write a report"),
     "evaluate": ("evaluate", "compare rollouts of a trained model with the ground truth"),
     "identify": ("identify", "find material parameters from observed motion, with intervals"),
+    "design": ("scenes.design", "move an obstacle until it guides bodies to a target"),
     "convert": ("convert", "import data of other projects, or your own arrays"),
     "benchmark": ("benchmark", "run a suite: times, acceptance, stress tests"),
 }

@@ -258,7 +258,7 @@ class Scene:
         """
         from gpe_pl.scenes.sliders import sliders
 
-        return sliders(self, model or self._shipped(), seconds)
+        return sliders(self, model or self.shipped(), seconds)
 
     def show(self) -> Path:
         """Draw the scene to a file, and return its path. Parts with a fault are red."""
@@ -309,27 +309,28 @@ class Scene:
     def _film(self, model: str | None, seconds: float | int, with_model: bool, with_solver: bool) -> Film:
         if not 0 < seconds <= 3600:
             raise SceneFault({"seconds": f"must be more than 0 and at most 3600, got {seconds}"})
-        chosen = model or self._shipped()
+        chosen = model or self.shipped()
         simulator = LearnedSimulator.from_checkpoint(chosen)
         state, metadata = self.state(simulator)
         num_frames, name = max(2, round(seconds / metadata.frame_dt)), model_name(chosen, ".")
         rollouts: dict[str, Trajectory] = {}
         if with_solver:
-            solver = self._solver(simulator)
+            solver = self.solver_of(simulator)
             rollouts["solver"] = solved(solver, state, metadata, num_frames, f"solver {solver.name}")
         if with_model:
             rollouts[name] = predicted(simulator, state, metadata, num_frames, f"model {name}")
         first, *_ = rollouts
         return Film(self.title, rollouts[first], {key: rollout for key, rollout in rollouts.items() if key != first})
 
-    def _solver(self, simulator: LearnedSimulator) -> Any:
+    def solver_of(self, simulator: LearnedSimulator) -> Any:
         """Return the solver of the model's training data for this box, rounded up to whole cells of its grid."""
         own = simulator.builder.metadata
         cell = settings(own)["solver"].get("grid_spacing")
         box = self.box if cell is None else [(low, low + cell * math.ceil((high - low) / cell - 1e-6)) for low, high in self.box]
         return recorded_solver(own, bounds=box, materials=own.materials)
 
-    def _shipped(self) -> str:
+    def shipped(self) -> str:
+        """Return the name of the shipped model of the material; raises ``SceneFault`` if there are several materials."""
         materials = {body.material for body in self._filled}
         if len(materials) != 1:
             here = ", ".join(sorted(materials)) or "the scene"

@@ -18,8 +18,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
 from scipy.optimize import minimize, minimize_scalar
 
-from gpe_pl.evaluation.identification.gradient_check import GradientCheck, gradient_check
-from gpe_pl.evaluation.identification.shooting import Shooting
+from gpe_pl.evaluation.identification.gradient_check import GradientCheck, Objective, gradient_check
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.system.progress import Progress
 
@@ -67,9 +66,9 @@ class Found:
     tried: list[tuple[np.ndarray, float]] = field(default_factory=list)
 
 
-def search(shooting: Shooting, settings: SearchSettings | None = None, on_progress: Progress | None = None) -> Found:
+def search(objective: Objective, settings: SearchSettings | None = None, on_progress: Progress | None = None) -> Found:
     """Return the unknowns with the smallest misfit among all that were tried."""
-    s, number = settings or SearchSettings(), len(shooting.unknowns)
+    s, number = settings or SearchSettings(), len(objective.unknowns)
     tried: list[tuple[np.ndarray, float]] = []
     total = s.max_evaluations + (s.num_scanned * number if number < ALL_AT_ONCE else 1)
 
@@ -80,34 +79,34 @@ def search(shooting: Shooting, settings: SearchSettings | None = None, on_progre
         return misfit
 
     def misfit(z: np.ndarray) -> float:
-        return note(z, shooting.misfit(np.clip(z, 0.0, 1.0)))
+        return note(z, objective.misfit(np.clip(z, 0.0, 1.0)))
 
     start, width = _scanned(misfit, number, s.num_scanned)
     base = min(value for _, value in tried)
 
-    def objective(z: np.ndarray) -> float:
+    def relative(z: np.ndarray) -> float:
         return math.exp(min(misfit(z) - base, LARGEST))
 
     check = None
-    if isinstance(shooting.simulator, LearnedSimulator) and (s.method == GRADIENT or (s.method == "auto" and number > 1)):
-        check = gradient_check(shooting, start + np.where(start < 0.5, width, -width))
+    if isinstance(objective.simulator, LearnedSimulator) and (s.method == GRADIENT or (s.method == "auto" and number > 1)):
+        check = gradient_check(objective, start + np.where(start < 0.5, width, -width))
     method = GRADIENT if check is not None and check.is_trusted else DERIVATIVE_FREE
     if method == GRADIENT:
 
         def with_gradient(z: np.ndarray) -> tuple[float, np.ndarray]:
-            value, gradient = shooting.misfit_and_gradient(z)
-            relative = math.exp(min(note(z, value) - base, LARGEST))
-            return relative, relative * gradient
+            value, gradient = objective.misfit_and_gradient(z)
+            ratio = math.exp(min(note(z, value) - base, LARGEST))
+            return ratio, ratio * gradient
 
         options = {"maxfun": s.max_evaluations, "ftol": 1e-6, "gtol": 1e-4}
         minimize(with_gradient, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * number, options=options)
     elif number == 1:
         bounds = (max(0.0, start[0] - width), min(1.0, start[0] + width))
         options = {"xatol": TOLERANCE, "maxiter": s.max_evaluations}
-        minimize_scalar(lambda z: objective(np.array([z])), bounds=bounds, method="bounded", options=options)
+        minimize_scalar(lambda z: relative(np.array([z])), bounds=bounds, method="bounded", options=options)
     else:
         options = {"initial_tr_radius": width, "final_tr_radius": TOLERANCE, "maxfev": s.max_evaluations}
-        minimize(objective, start, method="COBYQA", bounds=[(0.0, 1.0)] * number, options=options)
+        minimize(relative, start, method="COBYQA", bounds=[(0.0, 1.0)] * number, options=options)
     z, least = min(tried, key=lambda pair: pair[1])
     return Found(np.clip(z, 0.0, 1.0), least, method, check, tried)
 

@@ -1,0 +1,127 @@
+"""Pose of an obstacle in 2D: a shift, and a turn about its centre. Gradients pass from its boundary nodes to the pose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from gpe_pl.errors import GpeError
+from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, signed_distance
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
+
+NAMES = ("shift x", "shift y", "angle")
+"""Numbers of a pose: shift [m] and angle [rad]."""
+UNITS = ("m", "m", "deg")
+NUM_CHECKED = 5
+"""Number of values of each unknown at which contacts with other parts of the scene are looked for."""
+
+
+class PoseError(GpeError, ValueError):
+    """Raised for an obstacle that cannot be moved, or limits within which it touches other parts of the scene."""
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """An obstacle that can be moved.
+
+    Attributes:
+        shape: its shape at the start.
+        centre: point about which it turns [2] in m.
+        nodes: mask of its nodes among all boundary nodes.
+    """
+
+    shape: Sphere | Box | Polygon
+    centre: np.ndarray
+    nodes: np.ndarray
+
+    @classmethod
+    def of(cls, shape: Shape, boundary: Boundary) -> Obstacle:
+        """Return the obstacle with a shape, given the sampled boundary of its scene as arrays.
+
+        Raises:
+            PoseError: it is no disc, box or polygon in 2D, or touches another wall or obstacle.
+        """
+        if boundary.pos.shape[1] != 2 or not isinstance(shape, Sphere | Box | Polygon):
+            raise PoseError(
+                f"obstacle: discs, boxes and polygons in 2D can be moved, not {type(shape).__name__} in {boundary.pos.shape[1]}D"
+            )
+        others = tuple(other for other in boundary.shapes if other != shape)
+        points, _ = shape.sample(shape.extent / 50)
+        if others and bool((signed_distance(others, points) <= 0).any()):
+            raise PoseError("obstacle: it touches a wall or another obstacle; move it into free space")
+        nodes = np.abs(shape.signed_distance(boundary.pos)) <= 1e-6 * shape.extent
+        return cls(shape, _corners(shape).mean(axis=0), nodes)
+
+    def moved_shape(self, pose: Sequence[float]) -> Shape:
+        """Return the shape at a pose. A box becomes a polygon."""
+        if isinstance(self.shape, Sphere):
+            center = np.asarray(self.shape.center) + np.asarray(pose[:2])
+            return replace(self.shape, center=tuple(center.tolist()))
+        corners = _corners(self.shape)
+        moved = (
+            _turned(torch.from_numpy(corners - self.centre), torch.tensor(float(pose[2]), dtype=torch.float64)).numpy()
+            + self.centre
+            + np.asarray(pose[:2])
+        )
+        return Polygon(tuple((float(x), float(y)) for x, y in moved), self.shape.friction, self.shape.restitution)
+
+    def moved(self, state: State, pose: Float64[Tensor, "3"]) -> State:
+        """Return a state of tensors with the nodes of the obstacle at a pose. Gradients pass to the pose."""
+        boundary, rows = state.boundary, torch.from_numpy(self.nodes)[:, None]
+        centre = torch.from_numpy(self.centre)
+        pos = torch.where(rows, centre + pose[:2] + _turned(boundary.pos - centre, pose[2]), boundary.pos)
+        normal = torch.where(rows, _turned(boundary.normal.to(pos.dtype), pose[2]).to(boundary.normal.dtype), boundary.normal)
+        shape = self.moved_shape(pose.detach().tolist())
+        shapes = tuple(shape if own == self.shape else own for own in boundary.shapes)
+        return replace(state, boundary=replace(boundary, pos=pos, normal=normal, shapes=shapes))
+
+    def check_limits(self, limits: Sequence[float], boundary: Boundary, pos: np.ndarray, spacing: float) -> None:
+        """Check that the obstacle can take every pose within limits.
+
+        Args:
+            limits: largest shifts [m] and angle [rad], of both signs.
+            boundary: boundary of the scene, as arrays.
+            pos: positions of nodes at the start [node, 2].
+            spacing: rest spacing of nodes [m].
+
+        Raises:
+            PoseError: at some pose it touches a wall, another obstacle or a node; the message names the pose.
+        """
+        others = tuple(other for other in boundary.shapes if other != self.shape)
+        for pose in product(*(np.linspace(-limit, limit, NUM_CHECKED) if limit else (0.0,) for limit in limits)):
+            shape = self.moved_shape(pose)
+            points, _ = shape.sample(spacing)
+            touched = ["a wall or another obstacle"] if others and bool((signed_distance(others, points) <= 0).any()) else []
+            touched += ["the material"] if bool((shape.signed_distance(pos) <= 0).any()) else []
+            if touched:
+                raise PoseError(f"shift, angle: at {text(pose)} the obstacle touches {touched[0]}; choose smaller limits, or move it")
+
+
+def text(pose: Sequence[float]) -> str:
+    """Return a pose for readers."""
+    return f"a shift of ({pose[0]:.3g}, {pose[1]:.3g}) m and an angle of {math.degrees(pose[2]):.3g}°"
+
+
+def _corners(shape: Sphere | Box | Polygon) -> np.ndarray:
+    """Return the corners of a shape [corner, 2] in m, counter-clockwise; of a disc its centre."""
+    if isinstance(shape, Polygon):
+        return np.asarray(shape.vertices, float)
+    if isinstance(shape, Sphere):
+        return np.array([shape.center], float)
+    (left, bottom), (right, top) = shape.low, shape.high
+    return np.array([(left, bottom), (right, bottom), (right, top), (left, top)], float)
+
+
+def _turned(vectors: Tensor, angle: Tensor) -> Tensor:
+    """Return vectors [..., 2] turned counter-clockwise by an angle [rad]."""
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)

@@ -1,0 +1,233 @@
+"""Command ``gpe design scene.yaml target=0.8,0.1``: move and turn an obstacle until it guides the bodies of a scene to a target."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from gpe_pl.errors import GpeError
+from gpe_pl.scenes.film import Film, check_type
+from gpe_pl.scenes.rollouts import predicted, solved
+from gpe_pl.scenes.scene import Point, Scene
+from gpe_pl.system.command_line import ArgumentFault, command, integer, number, truth
+
+if TYPE_CHECKING:
+    from gpe_pl.trajectory.trajectory import Trajectory
+
+Method = Literal["auto", "gradient", "derivative_free"]
+METHODS: tuple[Method, ...] = ("auto", "gradient", "derivative_free")
+
+ABOUT = """Move an obstacle until it guides the bodies of a scene to a target: gpe design SCENE.yaml target=X,Y [KEY=VALUE …]
+
+  gpe design scene.yaml target=0.8,0.1                    the first obstacle, by a shipped model
+  gpe design scene.yaml target=0.8,0.1 shift=0.05 angle=45 seconds=0.8
+
+Settings (default)
+  target       point [m] that the nodes should reach
+  obstacle     number of the obstacle that is moved (1)
+  shift        largest shift [m] along each axis, in both directions (0.05)
+  angle        largest turn [deg], in both directions (30)
+  seconds      time after which distances from the target count (0.6)
+  checkpoint   shipped model, folder of a run, or path of a checkpoint (the shipped model of the material)
+  method       auto: gradients if a check by finite differences trusts them; gradient, derivative_free (auto)
+  evaluations  largest number of rollouts after the scan (30)
+  solve        also run the solver at the start and at the optimum (true)
+  file         viewer of the optimum; .png, .svg, .pdf, .gif, .mp4 and .npz also work (SCENE_design.html)"""
+
+
+class DesignFault(GpeError, ValueError):
+    """Raised for a design that cannot be sought; the message names the setting."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """The best pose of an obstacle, and how far nodes are from the target before and after.
+
+    Attributes:
+        scene: the scene with the obstacle at the best pose.
+        pose: shift [m] and angle [rad].
+        distances: root mean square distance of nodes from the target [m] of the search's rollouts, by ``model`` and ``solver``, at the start and at the best
+            pose.
+        rollouts: rollouts at the best pose, by name.
+        method: ``gradient`` or ``derivative_free``.
+        check: what a check of the gradient by finite differences found; empty without gradients.
+        num_rollouts, num_gradients: numbers of rollouts without and with a gradient.
+        processor_seconds: processor time of the search [s].
+    """
+
+    scene: Scene
+    pose: tuple[float, float, float]
+    distances: dict[str, tuple[float, float]]
+    rollouts: dict[str, Trajectory]
+    method: str
+    check: str
+    num_rollouts: int
+    num_gradients: int
+    processor_seconds: float
+
+    def summary(self) -> str:
+        """Return the pose, the distances and the cost, one a line."""
+        from gpe_pl.evaluation.design.pose import text
+
+        lines = [f"best pose: {text(self.pose)}"]
+        lines += [
+            f"{name}: distance from the target {after:.3g} m, {before:.3g} m at the start"
+            for name, (before, after) in self.distances.items()
+        ]
+        if len(self.distances) == 2:
+            promised, kept = (before - after for before, after in self.distances.values())
+            if promised > 0:
+                lines.append(f"the solver keeps {100 * kept / promised:.0f} % of the improvement that the model promises")
+        way = self.method.replace("_", "-")
+        lines.append(
+            f"search: {way}, {self.num_rollouts} rollouts and {self.num_gradients} gradients in {self.processor_seconds:.3g} s of processor time"
+        )
+        return "\n".join([*lines, *([self.check] if self.check else [])])
+
+    def film(self) -> Film:
+        """Return the rollouts at the best pose."""
+        first, *_ = self.rollouts
+        return Film(self.scene.title, self.rollouts[first], {key: value for key, value in self.rollouts.items() if key != first})
+
+
+def design(
+    scene: Scene,
+    target: Point,
+    obstacle: int = 1,
+    shift: float = 0.05,
+    angle: float = 30.0,
+    seconds: float = 0.6,
+    model: str | None = None,
+    method: Method = "auto",
+    evaluations: int = 30,
+    solve: bool = True,
+) -> Design:
+    """Find the pose of an obstacle with which the nodes of a scene come nearest to a target.
+
+    Args:
+        scene: the scene in 2D.
+        target: point that the nodes should reach [2] in m.
+        obstacle: number of the obstacle that is moved, from 1.
+        shift: largest shift along each axis [m], in both directions; 0 keeps the place.
+        angle: largest turn about the obstacle's centre [deg], in both directions; 0 keeps the angle. Discs do not turn.
+        seconds: time after which distances from the target count [s].
+        model: shipped model, folder of a run, or checkpoint; None takes the shipped model of the material.
+        method: ``auto`` uses gradients if a check by finite differences trusts them.
+        evaluations: largest number of rollouts after a scan of each unknown.
+        solve: also run the solver at the start and at the best pose.
+
+    Raises:
+        SceneFault: the scene is impossible, or does not fit the model.
+        DesignFault: a setting is impossible.
+        PoseError: the obstacle cannot be moved, or touches other parts of the scene within the limits.
+    """
+    from gpe_pl.evaluation.design.guidance import Guidance
+    from gpe_pl.evaluation.design.pose import Obstacle
+    from gpe_pl.evaluation.identification.search import SearchSettings, search
+    from gpe_pl.geometry.shapes import Sphere
+    from gpe_pl.learned.simulator import LearnedSimulator
+
+    _check(scene, target, obstacle, shift, angle, seconds, method, evaluations)
+    simulator = LearnedSimulator.from_checkpoint(model or scene.shipped())
+    state, metadata = scene.state(simulator)
+    name, shape = scene.obstacles[obstacle - 1]
+    movable = Obstacle.of(shape, state.boundary)
+    limits = (shift, shift, 0.0 if isinstance(shape, Sphere) else math.radians(angle))
+    movable.check_limits(limits, state.boundary, state.pos, metadata.spacing)
+    num_frames, goal = max(1, round(seconds / metadata.frame_dt)), np.asarray(target, np.float64)
+    start = simulator.standing(state, metadata)
+    guidance = Guidance(simulator, start, movable, limits, goal, num_frames, failed=(4 * metadata.longest_side) ** 2)
+    before, began = guidance.misfit(np.full(len(guidance.unknowns), 0.5)), time.process_time()
+    found = search(guidance, SearchSettings(method=method, num_scanned=3, max_evaluations=evaluations))
+    spent, best = time.process_time() - began, tuple(guidance.pose(found.z).tolist())
+    moved = replace(scene, obstacles=tuple((n, movable.moved_shape(best) if n == name else own) for n, own in scene.obstacles))
+    distances = {"model": (math.exp(before / 2), math.exp(found.misfit / 2))}
+    rollouts, at_best = {}, moved.state(simulator)[0]
+    if solve:
+        solver = scene.solver_of(simulator)
+        pair = [solved(solver, s, metadata, num_frames, f"solver {solver.name}") for s in (state, at_best)]
+        before_it, after_it = (float(np.sqrt(np.mean(np.sum((t.pos[-1].astype(np.float64) - goal) ** 2, axis=1)))) for t in pair)
+        distances["solver"], rollouts["solver"] = (before_it, after_it), pair[1]
+    rollouts["model"] = predicted(simulator, at_best, metadata, num_frames, "model")
+    check = "" if found.check is None else str(found.check)
+    return Design(moved, best, distances, rollouts, found.method, check, guidance.num_evaluations, guidance.num_gradients, spent)
+
+
+def _check(scene: Scene, target: Point, obstacle: int, shift: float, angle: float, seconds: float, method: str, evaluations: int) -> None:
+    """Raise ``DesignFault`` for a setting that is impossible in a scene."""
+    if scene.dim != 2:
+        raise DesignFault(f"box: has {scene.dim} axes; designs are for 2D")
+    if scene.zones:
+        raise DesignFault("openings: designs are for scenes without inlets and outlets, in which nodes stay")
+    goal = np.asarray(target, np.float64) if np.shape(target) == (2,) else np.full(2, np.nan)
+    if not all(low <= x <= high for x, (low, high) in zip(goal, scene.box, strict=True)):
+        raise DesignFault(f"target={target}: must be a point [x, y] in the box")
+    if not 1 <= obstacle <= len(scene.obstacles):
+        raise DesignFault(
+            f"obstacle={obstacle}: the scene has {len(scene.obstacles) or 'no'} obstacles; add one, or name one of them by number"
+        )
+    if not (0 <= shift < math.inf and 0 <= angle <= 180 and shift + angle > 0):
+        raise DesignFault(f"shift={shift} angle={angle}: must be at least 0, the angle at most 180, and not both 0")
+    if not 0 < seconds <= 60:
+        raise DesignFault(f"seconds={seconds}: must be more than 0 and at most 60")
+    if method not in METHODS:
+        raise DesignFault(f"method={method}: must be one of {', '.join(METHODS)}")
+    if evaluations < 1:
+        raise DesignFault(f"evaluations={evaluations}: must be at least 1")
+
+
+def _point(text: str) -> tuple[float, ...]:
+    try:
+        x, y = (float(part) for part in text.strip("[]()").split(","))
+    except ValueError:
+        raise ValueError("must be two numbers, such as 0.8,0.1") from None
+    return x, y
+
+
+def _method(text: str) -> str:
+    if text not in METHODS:
+        raise ValueError(f"must be one of {', '.join(METHODS)}")
+    return text
+
+
+KEYS: dict[str, Callable[[str], Any]] = {
+    "target": _point,
+    "obstacle": integer(1, 1000),
+    "shift": number(0.0, 1e3),
+    "angle": number(0.0, 180.0),
+    "seconds": number(1e-3, 60.0),
+    "checkpoint": str,
+    "method": _method,
+    "evaluations": integer(1, 10_000),
+    "solve": truth,
+    "file": Path,
+}
+
+
+def run(word: str | None, values: dict[str, Any]) -> None:
+    """Search, print the design, and write its film."""
+    from gpe_pl.scenes.scene_file import read_scene
+
+    if word is None:
+        raise ArgumentFault("gpe design: name a scene file, such as scene.yaml; `gpe predict --help` shows one")
+    given = dict(values)
+    file = given.pop("file", Path(f"{Path(word).stem}_design.html"))
+    check_type(file)
+    if "target" not in given:
+        raise ArgumentFault("gpe design: name the point that the bodies should reach, such as target=0.8,0.1")
+    model = given.pop("checkpoint", None)
+    found = design(read_scene(word), given.pop("target"), model=model, **given)
+    print(found.summary())
+    print(found.film().write(file))
+
+
+main = command(run, ABOUT, "scene file", KEYS)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""The pose of an obstacle: gradients through rollouts equal finite differences, poses stay within their limits, and impossible designs are refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gpe_pl.evaluation.design.guidance import Guidance
+from gpe_pl.evaluation.design.pose import Obstacle, PoseError
+from gpe_pl.evaluation.identification.search import SearchSettings, search
+from gpe_pl.geometry.shapes import Box, Polygon, Sphere, Wall, domain_walls
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.trajectory.boundary import Boundary
+from tests import scenes
+from tests.unit.training.test_unroll_gradients import Double, simulator_of, slow, unroll
+
+WALLS = domain_walls(((0.0, 1.0),) * 2, 0.3)
+RAMP = Polygon(((0.5, 0.2), (0.7, 0.25), (0.6, 0.4)), 0.3)
+BOX = Box((0.5, 0.2), (0.7, 0.3), 0.3)
+DISC = Sphere((0.6, 0.3), 0.1, 0.3)
+
+
+def boundary(shape: Any) -> Boundary:
+    return Boundary.sample((*WALLS, shape), scenes.SPACING, 2)
+
+
+@pytest.fixture(scope="module")
+def guidance() -> Guidance:
+    """Return a design with a small network in double precision, in whose scene nodes surround the obstacle."""
+    builder = scenes.builder(("sand",))
+    builder = Double(builder.config, builder.metadata)
+    state = replace(slow(scenes.state(high=0.9).to_torch()), boundary=torch_boundary(boundary(RAMP)))
+    simulator: LearnedSimulator = simulator_of(
+        GPE, builder, [unroll(builder, state, 1).graph], hidden_channels=8, num_message_passing_steps=1
+    )
+    return Guidance(simulator.eval(), state, Obstacle.of(RAMP, boundary(RAMP)), (0.02, 0.03, 0.1), np.array([0.2, 0.1]), 3, 100.0)
+
+
+def torch_boundary(own: Boundary) -> Boundary:
+    return replace(scenes.state(), boundary=own).to_torch().boundary
+
+
+def test_gradients_equal_finite_differences(guidance: Guidance) -> None:
+    z, step = np.array([0.6, 0.45, 0.7]), 1e-4
+    value, gradient = guidance.misfit_and_gradient(z)
+    assert value == pytest.approx(guidance.misfit(z), rel=1e-9)
+    for k, direction in enumerate(np.eye(3)):
+        difference = (guidance.misfit(z + step * direction) - guidance.misfit(z - step * direction)) / (2 * step)
+        assert abs(difference) > 1e-7
+        assert gradient[k] == pytest.approx(difference, rel=1e-2)
+
+
+def test_the_search_stays_within_the_limits_and_gains(guidance: Guidance) -> None:
+    found = search(guidance, SearchSettings(method="gradient", num_scanned=3, max_evaluations=5))
+    assert found.misfit < guidance.misfit([0.5, 0.5, 0.5])
+    assert (np.abs(guidance.pose(found.z)) <= np.array(guidance.limits) * (1 + 1e-12)).all()
+    only = replace(guidance, limits=(0.0, 0.03, 0.0))
+    assert only.unknowns == ("shift y",)
+    assert only.pose([1.0]).tolist() == [0.0, 0.03, 0.0]
+
+
+def test_a_rollout_that_fails_counts_as_failed(guidance: Guidance) -> None:
+    broken = replace(guidance, state=replace(guidance.state, pos=guidance.state.pos * torch.nan))
+    value, gradient = broken.misfit_and_gradient([0.5, 0.5, 0.5])
+    assert value == pytest.approx(math.log(100.0)) and not gradient.any()
+
+
+@pytest.mark.parametrize("shape", [RAMP, BOX, DISC])
+def test_nodes_and_shape_move_together(shape: Any) -> None:
+    own = boundary(shape)
+    obstacle, pose = Obstacle.of(shape, own), (0.05, -0.02, 0.4)
+    state = replace(scenes.state(), boundary=own).to_torch()
+    moved = obstacle.moved(state, torch.tensor(pose, dtype=torch.float64)).boundary
+    there = obstacle.moved_shape(pose)
+    nodes, count = obstacle.nodes, len(there.sample(scenes.SPACING)[0])
+    assert nodes.sum() == (count if not isinstance(shape, Box) else nodes.sum()) > 3
+    assert there in moved.shapes and shape not in moved.shapes
+    np.testing.assert_allclose(there.signed_distance(moved.pos.numpy()[nodes]), 0, atol=1e-9)
+    assert (there.signed_distance((moved.pos + 1e-3 * moved.normal).numpy()[nodes]) > 5e-4).all()
+    np.testing.assert_array_equal(moved.pos.numpy()[~nodes], own.pos[~nodes])
+
+
+def test_poses_that_touch_something_are_refused() -> None:
+    own, nothing = boundary(RAMP), np.empty((0, 2))
+    obstacle = Obstacle.of(RAMP, own)
+    obstacle.check_limits((0.05, 0.05, 0.2), own, nothing, scenes.SPACING)
+    with pytest.raises(PoseError, match=r"shift, angle: at a shift of \(.*\) m and an angle of 0° the obstacle touches a wall"):
+        obstacle.check_limits((0.0, 0.3, 0.0), own, nothing, scenes.SPACING)
+    beside = obstacle.centre + 0.95 * (np.array(obstacle.moved_shape((0.0, 0.0, 0.75)).vertices[1:2]) - obstacle.centre)  # type: ignore[attr-defined]
+    assert (RAMP.signed_distance(beside) > 0).all()
+    with pytest.raises(PoseError, match="touches the material"):
+        obstacle.check_limits((0.0, 0.0, 1.5), own, beside, scenes.SPACING)
+
+
+@pytest.mark.parametrize("shape", [Box((0.4, 0.0), (0.6, 0.2), 0.3), Wall((0.0, 1.0), 0.1, (0.0, 0.0), (1.0, 1.0), 0.3)])
+def test_obstacles_that_cannot_be_moved_are_refused(shape: Any) -> None:
+    with pytest.raises(PoseError, match="touches a wall or another obstacle|discs, boxes and polygons"):
+        Obstacle.of(shape, boundary(shape))

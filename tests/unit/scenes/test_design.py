@@ -1,0 +1,70 @@
+"""``gpe design``: impossible designs are refused in one line, and a small one is found and verified with the solver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpe_pl.errors import GpeError
+from gpe_pl.geometry.shapes import Polygon
+from gpe_pl.scenes import design as verb
+from gpe_pl.scenes.design import Design, design
+from gpe_pl.scenes.obstacles import Circle
+from gpe_pl.scenes.scene import Scene
+
+RAMP = Polygon(((0.30, 0.35), (0.34, 0.35), (0.34, 0.55), (0.30, 0.55)), 0.3)
+FILE = """
+box: [1.0, 1.0]
+bodies:
+  - {block: sand, at: [0.25, 0.62], size: [0.1, 0.1], velocity: [0, -2]}
+obstacles:
+  - {polygon: [[0.30, 0.35], [0.34, 0.35], [0.34, 0.55], [0.30, 0.55]], friction: 0.3}
+"""
+
+
+def scene(shape: Any = RAMP) -> Scene:
+    return Scene(box=(1.0, 1.0)).block("sand", at=(0.25, 0.62), size=(0.1, 0.1), velocity=(0.0, -2.0)).obstacle(shape)
+
+
+@pytest.mark.parametrize(
+    ("seek", "message"),
+    [
+        (lambda: design(scene(), (0.8, 1.2)), "target=(0.8, 1.2): must be a point [x, y] in the box"),
+        (lambda: design(scene(), (0.8, 0.1), obstacle=2), "obstacle=2: the scene has 1 obstacles; add one"),
+        (lambda: design(scene(), (0.8, 0.1), shift=0.0, angle=0.0), "shift=0.0 angle=0.0: must be at least 0, the angle at most 180, and not both 0"),
+        (lambda: design(scene(), (0.8, 0.1), shift=0.4), "the obstacle touches"),
+        (lambda: design(scene(), (0.8, 0.1), seconds=0.0), "seconds=0.0: must be more than 0"),
+        (lambda: design(scene(Circle((0.5, 0.05), 0.1)), (0.8, 0.1)), "obstacle: it touches a wall or another obstacle"),
+        (lambda: verb.run(None, {}), "gpe design: name a scene file"),
+        (lambda: verb.run("scene.yaml", {}), "gpe design: name the point that the bodies should reach"),
+    ],
+)  # fmt: skip
+def test_impossible_designs_are_refused_in_one_line(seek: Callable[[], Any], message: str) -> None:
+    with pytest.raises(GpeError) as caught:
+        seek()
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+def test_a_design_is_found_and_verified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("scene.yaml").write_text(FILE)
+    made: list[Design] = []
+
+    def kept(*args: Any, **values: Any) -> Design:
+        made.append(design(*args, **values))
+        return made[-1]
+
+    monkeypatch.setattr(verb, "design", kept)
+    verb.run("scene.yaml", {"target": (0.6, 0.3), "shift": 0.03, "angle": 0.0, "seconds": 0.05, "evaluations": 3, "file": Path("film.svg")})
+    printed = capsys.readouterr().out
+    assert "best pose: a shift of" in printed and "solver: distance from the target" in printed and Path("film.svg").exists()
+    before, after = made[0].distances["model"]
+    assert after <= before
+    assert (np.abs(made[0].pose) <= np.array([0.03, 0.03, 0.0]) + 1e-12).all()
+    ((_, moved),) = made[0].scene.obstacles
+    assert moved != RAMP or not any(made[0].pose)
