@@ -62,7 +62,7 @@ VELOCITY_RATIO = 1.25
 """A warning is given if displacements and velocities of a source differ by more than this factor."""
 FRAMES_COMPARED = 200
 """Number of first frames in which displacements and velocities are compared."""
-TYPED = ("gns", "lagrangebench", "meshgraphnets")
+TYPED = ("gns", "lagrangebench", "meshgraphnets", "calculix")
 """Formats with node types."""
 
 

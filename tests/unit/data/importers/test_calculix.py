@@ -1,0 +1,244 @@
+"""Decks and results of CalculiX become trajectories with clamps, forces, stress and constants of materials; others are refused by name."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics.rollouts import rollout_metrics
+from gpe_pl.models.gpe import GPE
+from gpe_pl.nn.elastic_motion import LOGARITHM_SCALE
+from gpe_pl.rollout.loop import rollout
+from gpe_pl.trajectory.store import iter_trajectories
+from gpe_pl.trajectory.strain import lame_parameters
+from gpe_pl.trajectory.trajectory import Trajectory
+
+SIZE, DT, FRAMES = 0.1, 0.01, 6
+POINTS = SIZE * np.argwhere(np.ones((3, 2, 2)))
+IDS = 101 + 2 * np.arange(12)
+"""Numbers of nodes in the files, with gaps."""
+CELLS = [[0, 4, 6, 2, 1, 5, 7, 3], [4, 8, 10, 6, 5, 9, 11, 7]]
+DECK = """** two cubes
+*NODE, NSET=ALL
+{nodes}
+*ELEMENT, TYPE=C3D8, ELSET=BODY
+*NSET, NSET=clamped, GENERATE
+101, 107, 2
+*NSET, NSET=TIP
+117, 119,
+121, 123
+*MATERIAL, NAME=Rubber
+*ELASTIC
+2e6, 0.4
+*DENSITY
+1200.
+*SOLID SECTION, ELSET=BODY, MATERIAL=RUBBER
+*AMPLITUDE, NAME=RISE
+0., 0., 0.02, 1.,
+1., 1.
+*BOUNDARY
+Clamped, 1, 3
+*STEP, NLGEOM,
+INC=100
+*DYNAMIC, DIRECT
+0.01, 0.06
+*CLOAD, AMPLITUDE=RISE
+TIP, 2, -4.
+*CLOAD
+117, 1, 0.5
+*DLOAD
+BODY, GRAV, 9.81, 0., 0., -1.
+*NODE FILE
+U
+*END STEP
+"""
+
+
+def row(mark: str, number: int, values: np.ndarray) -> str:
+    return f" {mark}{number:10d}" + "".join(f"{value:12.5E}" for value in values)
+
+
+def displacements(scale: float) -> np.ndarray:
+    """Return displacements [frame, node, 3] that grow with the distance from the clamp."""
+    time = DT * np.arange(1, FRAMES + 1)[:, None, None]
+    return scale * np.sin(40 * time) * (POINTS[:, :1] ** 2) * np.array([0.1, -1.0, 0.3])
+
+
+def stresses() -> np.ndarray:
+    """Return stresses [frame, node, 6] in the order of the files, which tell their place."""
+    return 100.0 * np.arange(1, FRAMES + 1)[:, None, None] + 10.0 * np.arange(12)[:, None] + np.arange(6)
+
+
+def results(moved: np.ndarray, times: np.ndarray, code: int = 1) -> str:
+    lines = ["    1C", "    1UMAT    1RUBBER", f"    2C{len(IDS):30d}{1:38d}"]
+    lines += [row("-1", int(node), x) for node, x in zip(IDS, POINTS, strict=True)]
+    lines += [" -3", f"    3C{2:30d}{1:38d}"]
+    for k, cell in enumerate(CELLS, start=1):
+        lines += [f" -1{k:10d}{code:5d}{0:5d}{1:5d}", " -2" + "".join(f"{IDS[node]:10d}" for node in cell)]
+    lines.append(" -3")
+    for time, u, s in zip(times, moved, stresses(), strict=True):
+        for name, names, values in (("DISP", ("D1", "D2", "D3", "ALL"), u), ("STRESS", ("SXX", "SYY", "SZZ", "SXY", "SYZ", "SZX"), s)):
+            lines += [f"  100CL  101{time:12.5E}{len(IDS):12d}{'':20}{1:1d}{1:5d}{'':10}{1:2d}", f" -4  {name:8}{len(names):5d}    1"]
+            lines += [f" -5  {component:8}    1    2    1    0" for component in names]
+            lines += [*(row("-1", int(node), x) for node, x in zip(IDS, values, strict=True)), " -3"]
+    return "\n".join([*lines, " 9999"]) + "\n"
+
+
+def write(folder: Path, edit: Callable[[str], str] = str, edit_results: Callable[[str], str] = str, step: float = DT) -> None:
+    nodes = "\n".join(f"{node}, {x:.6g}, {y:.6g}, {z:.6g}" for node, (x, y, z) in zip(IDS, POINTS, strict=True))
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(3):
+        times = step * np.arange(1, FRAMES + 1)
+        (folder / f"beam_{k}.inp").write_text(edit(DECK.format(nodes=nodes)))
+        (folder / f"beam_{k}.frd").write_text(edit_results(results(displacements(1 + k), times)))
+
+
+def imported(tmp_path: Path, **settings: object) -> list[Trajectory]:
+    report = import_dataset(tmp_path / "data", ImportSettings("calculix", str(tmp_path / "raw"), "set", **settings))  # type: ignore[arg-type]
+    assert not report.refusals
+    return [t for split in report.splits for t in iter_trajectories(tmp_path / "data" / "set" / "imported", split)]
+
+
+def test_a_computation_becomes_a_trajectory(tmp_path: Path) -> None:
+    write(tmp_path / "raw")
+    found = imported(tmp_path)
+    assert len(found) == 3
+    scale = [np.abs(t.pos[1] - t.pos[0]).max() for t in found]
+    own, u = found[int(np.argmin(scale))], displacements(1.0)
+    assert own.num_frames == FRAMES + 1 and own.metadata.frame_dt == pytest.approx(DT)
+    np.testing.assert_allclose(own.pos[1:] - own.pos[:1], u, atol=1e-7)
+    assert own.rest_pos is not None and own.cells is not None and own.cell_dim == 3
+    np.testing.assert_allclose(own.rest_pos - own.rest_pos[0], POINTS, atol=1e-7)
+    assert own.cells.tolist() == CELLS
+    assert own.prescribed is not None and own.prescribed.tolist() == [True] * 4 + [False] * 8
+    assert own.metadata.param_names == ("youngs_modulus", "poisson_ratio") and own.metadata.materials == ("solid",)
+    np.testing.assert_allclose(own.material_params, np.tile([2e6, 0.4], (12, 1)), rtol=1e-6)
+    np.testing.assert_allclose(own.mass, 1200 * SIZE**3 / 8 * np.repeat([1, 2, 1], 4), rtol=1e-6)
+    assert own.metadata.gravity == (0.0, 0.0, -9.81)
+    force = np.zeros((FRAMES + 1, 12, 3))
+    force[:, 8:, 1] = -4.0 * np.array([0.25, 0.75, 1, 1, 1, 1, 1])[:, None]  # means over frames of a rise within two frames
+    force[:, 8, 0] = 0.5
+    assert own.force is not None
+    np.testing.assert_allclose(own.force, force, rtol=1e-6)
+    assert own.stress is not None and not own.stress.node[0].any()
+    np.testing.assert_array_equal(own.stress.node[2, 3], 230 + np.array([0, 3, 5, 1, 4, 2]))
+
+
+def test_materials_can_be_named_and_constants_given(tmp_path: Path) -> None:
+    write(tmp_path / "raw", lambda deck: deck.replace("*ELASTIC\n2e6, 0.4\n", "*HYPERELASTIC\n1., 2.\n"))
+    own, *_ = imported(tmp_path, materials={1: "elastomer"}, parameters={"elastomer": 7e5})
+    assert own.metadata.materials == ("elastomer",)
+    np.testing.assert_allclose(own.material_params[:, 0], 7e5)
+
+
+def test_nodes_that_are_held_along_some_axes_are_free_and_named(tmp_path: Path) -> None:
+    write(tmp_path / "raw", lambda deck: deck.replace("Clamped, 1, 3\n", "Clamped, 1, 2\nTIP, ENCASTRE\n"))
+    report = import_dataset(tmp_path / "data", ImportSettings("calculix", str(tmp_path / "raw"), "set"))
+    own = next(iter_trajectories(tmp_path / "data" / "set" / "imported", "train"))
+    assert own.prescribed is not None and own.prescribed.tolist() == [False] * 8 + [True] * 4
+    assert any("4 nodes are held along some axes only" in str(event) for event in report.warnings)
+
+
+@pytest.mark.parametrize(
+    ("edit", "edit_results", "message"),
+    [
+        (lambda d: d.replace("*DENSITY\n1200.\n", ""), str, "material RUBBER has no \\*DENSITY"),
+        (lambda d: d.replace("GRAV, 9.81, 0., 0., -1.", "P1, 5."), str, r"\*DLOAD is a distributed load; give forces on nodes as \*CLOAD"),
+        (lambda d: d + "*STEP\n*END STEP\n", str, "has 2 steps, must have one"),
+        (lambda d: d.replace("TIP, 2, -4.", "TOP, 2, -4."), str, r"\*CLOAD cannot be read \(unknown set of nodes 'TOP'\)"),
+        (str, lambda r: r.replace("    1    0    1", "    4    0    1"), "element 1 is quadratic or of an unknown type"),
+        (str, lambda r: r.replace("DISP", "VELO"), "has no displacements"),
+        (str, lambda r: r[: len(r) // 2], "is damaged or of another format .it ends within a block"),
+        (str, lambda r: r.replace(" 5.00000E-02", " 5.50000E-02"), "intervals between results are .* DIRECT"),
+        (str, lambda r: r.replace("1\n -1       101", "2\n -1       101"), "binary values"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_by_name(
+    tmp_path: Path, edit: Callable[[str], str], edit_results: Callable[[str], str], message: str
+) -> None:
+    write(tmp_path / "raw", edit, edit_results)
+    with pytest.raises(ImportFailure, match=message):
+        imported(tmp_path)
+
+
+def test_missing_results_are_named(tmp_path: Path) -> None:
+    write(tmp_path / "raw")
+    for file in (tmp_path / "raw").glob("*.frd"):
+        file.unlink()
+    with pytest.raises(ImportFailure, match=r"beam_0.frd is missing; run CalculiX: ccx -i beam_0"):
+        imported(tmp_path, frame_dt=DT)
+
+
+needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed (Debian: apt-get install calculix-ccx)")
+
+
+@needs_ccx
+def test_results_of_calculix_itself(tmp_path: Path) -> None:
+    """A cube that is clamped at one face and pulled at the other first accelerates by force over mass of its free half."""
+    write(tmp_path / "raw")
+    elements = "\n".join(f"{k}, {', '.join(str(IDS[node]) for node in cell)}" for k, cell in enumerate(CELLS, start=1))
+    for k, file in enumerate(sorted((tmp_path / "raw").glob("*.inp"))):
+        deck = file.read_text().replace("ELSET=BODY\n", f"ELSET=BODY\n{elements}\n", 1)
+        deck = deck.replace("TIP, 2, -4.", f"TIP, 2, {-4.0 - k}").replace("U\n*END", "U\n*EL FILE\nS\n*END")
+        file.write_text(deck)
+        subprocess.run(["ccx", "-i", file.stem], cwd=file.parent, check=True, capture_output=True, timeout=60)
+    found = imported(tmp_path)
+    assert len(found) == 3
+    for own in found:
+        assert own.num_frames == FRAMES + 1 and own.prescribed is not None and own.stress is not None and own.force is not None
+        assert not np.ptp(own.pos[:, own.prescribed], axis=0).any()
+        assert (own.pos[-1, 8:, 1] < own.pos[0, 8:, 1]).all()
+        assert np.abs(own.stress.node[-1, :4, 0]).max() > np.abs(own.stress.node[-1, 8:, 0]).max()  # bending is largest at the clamp
+
+
+def decks() -> Any:
+    """Return the module of ``docs/fem_decks.py``."""
+    spec = importlib.util.spec_from_file_location("fem_decks", Path(__file__).parents[4] / "docs" / "fem_decks.py")
+    assert spec is not None and spec.loader is not None
+    module = sys.modules["fem_decks"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@needs_ccx
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["cantilever", "plate"])
+def test_the_elastic_law_with_true_constants_follows_calculix(tmp_path: Path, case: str) -> None:
+    """Clamps, forces and cells are those of CalculiX, which integrates plain hexahedra implicitly; nothing is trained."""
+    made = decks()
+    (tmp_path / "raw").mkdir()
+    chosen = replace(made.CASES[case], element="C3D8", num_frames=25)
+    for k in range(3):
+        path = tmp_path / "raw" / f"{k}.inp"
+        path.write_text(made.deck(replace(chosen, load=chosen.load * (1 + k / 8))))
+        made.run(path)
+    truth = imported(tmp_path, materials={1: "elastomer"})[0]
+    m = truth.metadata
+    build = GraphBuilder(GraphConfig(history=1, mesh=True, islands=True, cells=True), m)
+    settings: dict[str, Any] = {"num_message_passing_steps": 1, "hidden_channels": 4, "elastic": True, "decoder": "contact"}
+    simulator = LearnedSimulator(GPE(build.spec, **settings, only_contacts=True), build).eval()
+    simulator.standardizer.mass.fill_(float(truth.mass.mean()))
+    simulator.set_units_of(simulator.model)
+    lam, mu = lame_parameters(chosen.modulus, chosen.poisson_ratio)
+    unit = float(truth.mass.mean()) / (m.spacing * m.frame_dt**2)
+    law = simulator.model.elastic_bodies.constants["elastomer"].logarithm  # type: ignore[union-attr,index]
+    with torch.no_grad():
+        law["bias"].copy_(torch.tensor([np.log(lam / unit), np.log(mu / unit), -20.0]) / LOGARITHM_SCALE)
+    found = rollout(simulator, simulator.initial_state(truth, 1), truth.num_frames - 2, m)
+    errors = {r.metric: r.value for r in rollout_metrics(found, truth.frames(1), ["full"])}
+    assert found.termination is None and errors["displacement_error"] < 0.1
+    assert np.abs(truth.pos - truth.pos[0]).max() > 0.1 * m.spacing
