@@ -228,17 +228,17 @@ def drawn(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
     if not panels:
         return {}
     rows = math.ceil(len(panels) / COLUMNS)
-    figure = new_figure(2.3 * COLUMNS, 2.1 * rows)
+    figure = new_figure(1.8 * COLUMNS, 1.8 * rows)
     figure.set_layout_engine("constrained")
     grid = np.ravel(figure.subplots(rows, COLUMNS, squeeze=False))
     for axes, r in zip(grid, panels, strict=False):
         label = SCENES[r["engine_name"]].label
         for key, style in (("engine", ":"), ("solver", "-"), ("model", "--")):
             axes.plot(r["x"][: len(r[key])], r[key], style, label=label if key == "engine" else key)
-        axes.set_title(f"{r['parameter']}\n{r['quantity']} [m]", fontsize="x-small")
-        axes.tick_params(labelsize="x-small")
-        axes.set_xlabel("t [s]", fontsize="x-small")
-        axes.legend(fontsize="x-small")
+        axes.set_title(f"{r['parameter']}\n{r['quantity']} [m]", fontsize="xx-small")
+        axes.tick_params(labelsize="xx-small")
+        axes.set_xlabel("t [s]", fontsize="xx-small")
+        axes.legend(fontsize="xx-small")
     for axes in grid[len(panels) :]:
         axes.set_visible(False)
     return {"engines": figure}
