@@ -50,7 +50,9 @@ class Pace:
     def rate(self) -> str:
         """Return the rate as text, as the time of one where that is longer than a second."""
         rate = self.per_second
-        return "" if rate <= 0 else f"{rate:.3g}/s" if rate >= 1 else f"{1 / rate:.3g} s each"
+        if rate <= 0:
+            return ""
+        return f"{rate:.3g}/s" if rate >= 1 else f"{1 / rate:.{0 if rate < 0.01 else 1}f} s each"
 
     def remaining(self, total: int) -> str:
         """Return the time until ``total`` is done, which goes on falling between two updates."""

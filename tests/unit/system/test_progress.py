@@ -32,6 +32,8 @@ def test_work_done_before_a_resumed_command_began_does_not_count() -> None:
 def test_parts_that_take_minutes_have_a_rate_and_the_remaining_time_falls_between_them() -> None:
     pace, clock = pace_of((0.0, 0), (120.0, 1), (240.0, 2))
     assert (pace.rate(), pace.remaining(8)) == ("120 s each", "0:12:00")
+    assert pace_of((0.0, 0), (1140.0, 1))[0].rate() == "1140 s each"
+    assert pace_of((0.0, 0), (5.0, 2))[0].rate() == "2.5 s each"
     clock.now = 300.0
     assert pace.remaining(8) == "0:11:00"
     clock.now = 4000.0
