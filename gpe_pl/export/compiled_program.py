@@ -1,0 +1,61 @@
+"""Export of a trained model as a compiled program that C++ runs with LibTorch, without Python.
+
+``export.program`` writes a program that Python loads. This module compiles it with PyTorch's AOTInductor for the processor of this machine. The package takes
+and returns the same tensors, in the order of ``export.program.describe``: inputs as ``scene_of`` returns them; outputs as positions and velocity histories of
+each material, then accelerations and stresses. ``examples/cpp`` has a caller. Compiling takes about a minute and needs a C++ compiler.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from gpe_pl.errors import GpeError
+from gpe_pl.export.onnx_network import TOLERANCE
+from gpe_pl.export.program import export_model, scene_of
+from gpe_pl.files.atomic import replace_bytes
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.trajectory.state import State
+
+
+class CompiledProgramError(GpeError):
+    """Raised when a compiled program moves nodes elsewhere than its model."""
+
+
+def export_compiled(simulator: LearnedSimulator, path: Path | str, states: Sequence[State]) -> float:
+    """Compile a simulator's step and write it as a package for LibTorch, which appears complete or not at all.
+
+    Args:
+        simulator: simulator whose step ``export_model`` can write.
+        path: file that ends in ``.pt2``.
+        states: states with velocity history from which the compiled program and the simulator make a step, at least one.
+
+    Returns:
+        The largest difference of a position after these steps [m].
+
+    Raises:
+        CompiledProgramError: the compiled program moves a node elsewhere, by more than ``TOLERANCE``; nothing is written.
+        CellError, MirrorAverageError, RigidBodyError, ValueError: as ``export_model`` and ``scene_of`` raise them.
+    """
+    if Path(path).suffix != ".pt2":
+        raise ValueError(f"{path}: a compiled program ends in .pt2")
+    scenes = [scene_of(simulator, state) for state in states]
+    with tempfile.TemporaryDirectory(prefix="gpe_") as folder, torch.no_grad():
+        plain, compiled = Path(folder) / "plain.pt2", Path(folder) / "compiled.pt2"
+        export_model(simulator, plain)
+        inductor = torch._inductor
+        inductor.aoti_compile_and_package(torch.export.load(plain), package_path=str(compiled))
+        step = inductor.aoti_load_package(str(compiled))
+        found = 0.0
+        for state, scene in zip(states, scenes, strict=True):
+            moved, expected = step(scene)[0], scene_of(simulator, simulator.step(state))
+            found = max(found, *(float((moved[name] - expected[name]).abs().max()) for name in moved if name.startswith("pos.")))
+        if not found <= TOLERANCE:
+            raise CompiledProgramError(
+                f"one step of the compiled program differs from that of the model by {found:.3g} m, at most {TOLERANCE:g} m are allowed"
+            )
+        replace_bytes(Path(path), compiled.read_bytes())
+    return found
