@@ -96,8 +96,15 @@ MESH_MATERIALS = ("elastomer", "solid")
 LOADS = ("motion", "force")
 """What data sets can give of nodes as boundary conditions: the motion of some nodes, and forces on nodes."""
 
-CELL_KINDS: dict[str, tuple[int, int]] = {"triangle": (2, 3), "quadrilateral": (2, 4), "tetrahedron": (3, 4), "hexahedron": (3, 8)}
-"""Dimension and number of corners of each kind of mesh cell. Corners are in VTK's order."""
+CELL_KINDS: dict[str, tuple[int, int]] = {
+    "line": (1, 2),
+    "triangle": (2, 3),
+    "quadrilateral": (2, 4),
+    "tetrahedron": (3, 4),
+    "wedge": (3, 6),
+    "hexahedron": (3, 8),
+}
+"""Dimension and number of corners of each kind of mesh cell. Corners are in VTK's order. Four corners are a quadrilateral or a tetrahedron."""
 
 BOUNDARY = "boundary"
 NODE_TYPES: tuple[str, ...] = (*MATERIALS, BOUNDARY)
@@ -205,7 +212,7 @@ Values = Literal[
     "nodes of cells",  # rows of nodes; the number of different nodes is that of a kind of cell
     "numbers of bodies",  # −1 for none
     "one stretch",  # 0 or 1, and 1 in consecutive frames only
-    "dimension of cells",  # 2 or 3, and at most the dimension of space
+    "dimension of cells",  # 1, 2 or 3, and at most the dimension of space
 ]
 """Rules for the values of stored arrays. ``gpe_pl.trajectory.values`` checks them."""
 
@@ -305,7 +312,7 @@ FIELDS: dict[str, Field] = {
         ("one",),
         "uint8",
         "1",
-        "dimension of the cells: 2 for triangles and quadrilaterals, 3 for tetrahedra and hexahedra; by default that of space",
+        "largest dimension of the cells: 1 for lines, 2 for triangles and quadrilaterals, 3 for tetrahedra, wedges and hexahedra; by default that of space",
         required=False,
         values="dimension of cells",
     ),

@@ -29,7 +29,7 @@ from gpe_pl.trajectory.store import stored_arrays, stored_attributes
 from gpe_pl.trajectory.trajectory import Trajectory
 
 VERTEX = 1
-CELL_TYPES = {"triangle": 5, "quadrilateral": 9, "tetrahedron": 10, "hexahedron": 12}
+CELL_TYPES = {"line": 3, "triangle": 5, "quadrilateral": 9, "tetrahedron": 10, "wedge": 13, "hexahedron": 12}
 """VTK's codes for kinds of cells."""
 
 SYMMETRIC = {4: (0, 2, 3, 1), 6: (0, 3, 5, 1, 4, 2)}

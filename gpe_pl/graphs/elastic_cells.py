@@ -182,9 +182,9 @@ def _cells(state: State, rows: Tensor, material: str, dim: int) -> Tensor:
     cells: Tensor = row[state.cells.long()]
     cells = cells[(cells >= 0).all(dim=1)]
     are_surfaces = state.cell_dim not in (None, dim)
-    if are_surfaces or bool((cells[:, 1:] == cells[:, :-1]).any()):
+    if are_surfaces or cells.shape[1] not in (dim + 1, 2**dim) or bool((cells[:, 1:] == cells[:, :-1]).any()):
         raise GraphError(
             f"{material}: graph.cells=true needs {'triangles or quadrilaterals' if dim == 2 else 'tetrahedra or hexahedra'}, "
-            f"this mesh {'is a surface' if are_surfaces else 'mixes them'}; choose graph.cells=false model.elastic=false"
+            f"this mesh {'is a surface or has lines' if are_surfaces else 'mixes them or has others'}; choose graph.cells=false model.elastic=false"
         )
     return cells

@@ -94,14 +94,14 @@ def strain_energy(trajectory: Trajectory) -> Float[np.ndarray, "frame"] | None:
     per particle, so its own energy differs from that of the cells between its particles.
 
     Returns:
-        None without a mesh, for surfaces in 3D, and where Young's modulus or Poisson's ratio is not known.
+        None without a mesh, for lines, surfaces in 3D and wedges, and where Young's modulus or Poisson's ratio is not known.
     """
     if trajectory.cells is None or trajectory.rest_pos is None or not len(trajectory.cells):
         return None
     dim, cells = trajectory.metadata.dim, trajectory.cells.astype(np.int64)
     modulus, poisson_ratio = (mean_over_corners(values, cells) for values in _elastic_constants(trajectory))
     kinds = kinds_of(cells, trajectory.cell_dim, dim)
-    solid = [code for code, (own_dim, _) in enumerate(CELL_KINDS.values()) if own_dim == dim]
+    solid = [code for code, (own_dim, corners) in enumerate(CELL_KINDS.values()) if own_dim == dim and corners in (dim + 1, 2**dim)]
     if trajectory.cell_dim not in (None, dim) or not (np.isin(kinds, solid) & np.isfinite(modulus) & np.isfinite(poisson_ratio)).all():
         return None
     lam, mu = lame_parameters(modulus, poisson_ratio)

@@ -237,9 +237,9 @@ def checked_force(force: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, int]:
-    """Return all cells of a mesh in one array [cell, corner], and their dimension: 2 for surfaces, 3 for volumes. In 2D it is 2.
+    """Return all cells of a mesh in one array [cell, corner], and their largest dimension: 1 for lines, 2 for surfaces, 3 for volumes.
 
-    Cells with fewer corners than others repeat their last corner.
+    Cells with fewer corners than others repeat their last corner. Kinds may be mixed, except for quadrilaterals beside volumes.
 
     Args:
         cells: nodes of each cell [cell, corner], or such arrays by kind of cell, a key of ``schema.CELL_KINDS``.
@@ -248,8 +248,8 @@ def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, 
 
     Raises:
         ArrayError: an array is not of integers or has another shape; a kind is unknown, or impossible in this dimension; the kind is missing for cells with
-            four corners in 3D; surfaces and volumes are mixed; or a cell repeats a node, has a node that does not exist, has nodes of several materials, or has
-            nodes of a material that cannot have a mesh.
+            four corners in 3D; quadrilaterals and volumes are mixed; or a cell repeats a node, has a node that does not exist, has nodes of several materials,
+            or has nodes of a material that cannot have a mesh.
     """
     if not isinstance(cells, Mapping):
         array = _integers("cells", cells)
@@ -268,10 +268,10 @@ def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, 
             if kind not in possible:
                 raise ArrayError(f"cells: unknown kind {kind!r:.80}; in {dim}D there are {', '.join(possible)}")
         groups = {kind: _checked_kind(f"cells[{kind!r}]", _integers(f"cells[{kind!r}]", cells[kind]), kind, codes) for kind in cells}
-    dims = {CELL_KINDS[kind][0] for kind in groups}
-    if len(dims) != 1:
-        raise ArrayError(f"cells: has {', '.join(groups) or 'no kind'}; the cells of a trajectory are all surfaces or all volumes")
-    return stacked(groups), dims.pop()
+    largest = max((CELL_KINDS[kind][0] for kind in groups), default=0)
+    if largest == 0 or (largest == 3 and "quadrilateral" in groups):  # four corners would be a tetrahedron
+        raise ArrayError(f"cells: has {', '.join(groups) or 'no kind'}; give triangles instead of quadrilaterals beside volumes")
+    return stacked(groups), largest
 
 
 def _integers(name: str, cells: Any) -> np.ndarray:

@@ -32,7 +32,7 @@ def kinds_of(cells: np.ndarray, cell_dim: int | None, dim: int) -> np.ndarray:
 
     Args:
         cells: nodes of each cell [cell, corner].
-        cell_dim: dimension of the cells; None stands for the dimension of space, except for triangles.
+        cell_dim: largest dimension of the cells; None stands for the dimension of space. It tells quadrilaterals from tetrahedra.
         dim: dimension of space.
     """
     ordered = np.sort(cells, axis=1)
@@ -40,7 +40,8 @@ def kinds_of(cells: np.ndarray, cell_dim: int | None, dim: int) -> np.ndarray:
     repeated = (is_corner(cells) != (np.arange(cells.shape[1]) < corners[:, None])).any(axis=1)  # except the last corner
     kinds = np.full(len(cells), -1)
     for code, (own_dim, number) in enumerate(CELL_KINDS.values()):
-        kinds[(corners == number) & (own_dim == (cell_dim or dim) or number == 3)] = code
+        is_possible = own_dim == (cell_dim or dim) if number == 4 else own_dim <= dim
+        kinds[(corners == number) & is_possible] = code
     kinds[repeated] = -1
     return kinds
 

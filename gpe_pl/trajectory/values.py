@@ -192,9 +192,9 @@ def _cells(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
 
 def _dimension_of_cells(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
     dim = scene.arrays["pos"].shape[2]
-    bad = (array < 2) | (array > dim)
+    bad = (array < 1) | (array > dim)
     if bad.any():
-        yield _Found(bad, lambda place: f"is {array[place]}, must be 2{' or 3' if dim == 3 else ''} in {dim}D")
+        yield _Found(bad, lambda place: f"is {array[place]}, must be {'1, 2 or 3' if dim == 3 else '1 or 2'} in {dim}D")
 
 
 def _bodies(_: _Scene, array: np.ndarray) -> Iterator[_Found]:

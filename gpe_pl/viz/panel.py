@@ -30,6 +30,7 @@ HAZE, HIDDEN = 0.3, 0.25
 
 FACES = {
     "tetrahedron": np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]),
+    "wedge": np.array([[0, 1, 2, 2], [3, 5, 4, 4], [0, 3, 4, 1], [1, 4, 5, 2], [2, 5, 3, 0]]),
     "hexahedron": np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]),
 }
 """Corners of each face of a volume cell."""
@@ -38,7 +39,8 @@ FACES = {
 def drawn_faces(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Return polygons that show a mesh, as nodes [face, corner], and the cell of each [face].
 
-    They are the cells of a 2D or surface mesh, or the outer faces of a volume mesh. A volume mesh with more than ``MAX_FACES`` of them has none.
+    They are the cells of a 2D or surface mesh, or the outer faces of a volume mesh and its other cells. A line is a polygon without area. A volume mesh
+    with more than ``MAX_FACES`` faces has none.
     """
     cells = trajectory.cells
     if cells is None or len(cells) == 0:
@@ -48,11 +50,12 @@ def drawn_faces(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     if trajectory.metadata.dim == 2 or not np.isin(kinds, [names.index(kind) for kind in FACES]).any():
         return cells, np.arange(len(cells))
     rows = {kind: np.flatnonzero(kinds == names.index(kind)) for kind in FACES}
-    faces = stacked(
-        {kind: cells[rows[kind]][:, corners].reshape(-1, corners.shape[1]) for kind, corners in FACES.items() if len(rows[kind])}
-    )
-    of_cell = np.concatenate([np.repeat(rows[kind], len(corners)) for kind, corners in FACES.items()])
-    outer = _that_occur_once(faces)
+    flat = np.flatnonzero(~np.isin(kinds, [names.index(kind) for kind in FACES]))
+    groups = {kind: cells[rows[kind]][:, corners].reshape(-1, corners.shape[1]) for kind, corners in FACES.items() if len(rows[kind])}
+    faces = stacked(groups | {"flat": cells[flat][:, :4]})
+    of_cell = np.concatenate([*(np.repeat(rows[kind], len(corners)) for kind, corners in FACES.items()), flat])
+    num_volume = len(faces) - len(flat)
+    outer = np.concatenate([_that_occur_once(faces[:num_volume]), np.arange(num_volume, len(faces))])
     return (faces[outer], of_cell[outer]) if len(outer) <= MAX_FACES else (np.empty((0, 3), int), np.empty(0, int))
 
 

@@ -123,6 +123,8 @@ def _add_cells(found: Results, lines: list[str], width: int) -> None:
             nodes = [int(line[k : k + width]) for k in range(3, len(line.rstrip()), width)]
             cells.setdefault(kind, []).append([row[node] for node in nodes])
     found.cells = {kind: np.array(rows) for kind, rows in cells.items()}
+    if "wedge" in cells:  # VTK numbers the triangles of wedges the other way round
+        found.cells["wedge"] = found.cells["wedge"][:, [0, 2, 1, 3, 5, 4]]
     found.material = {kind: np.array(numbers) for kind, numbers in material.items()}
 
 

@@ -172,8 +172,8 @@ def test_what_does_not_fit_is_named(changes: dict[str, Any], message: str) -> No
             [[0, 1, 6, 5], [1, 2, 7]],
             "^cells: rows have different lengths; give cells by kind, such as {'triangle': …, 'quadrilateral': …}$",
         ),
-        ([[0, 1, 2, 3, 4]], r"^cells: has shape \[1, 5\], expected .* of a kind: triangle 3, quadrilateral 4$"),
-        ({"tetrahedron": [[0, 1, 2, 3]]}, "^cells: unknown kind 'tetrahedron'; in 2D there are triangle, quadrilateral$"),
+        ([[0, 1, 2, 3, 4]], r"^cells: has shape \[1, 5\], expected .* of a kind: line 2, triangle 3, quadrilateral 4$"),
+        ({"tetrahedron": [[0, 1, 2, 3]]}, "^cells: unknown kind 'tetrahedron'; in 2D there are line, triangle, quadrilateral$"),
         ({"triangle": [[0, 1, 2, 3]]}, r"^cells\['triangle'\]: has shape \[1, 4\], expected \[cell, 3\]$"),
         ({}, "^cells: has no kind"),
     ],
@@ -188,8 +188,8 @@ def test_four_corners_in_space_are_declared() -> None:
     message = "^cells: with 4 corners in 3D they are quadrilateral or tetrahedron; say which: cells={'quadrilateral': …}$"
     with pytest.raises(ArrayError, match=message):
         trajectory(**shape, cells=[[0, 1, 2, 3]])
-    with pytest.raises(ArrayError, match="^cells: has triangle, tetrahedron; the cells of a trajectory are all surfaces or all volumes$"):
-        trajectory(**shape, cells={"triangle": [[0, 1, 2]], "tetrahedron": [[0, 1, 2, 3]]})
+    with pytest.raises(ArrayError, match="^cells: has quadrilateral, wedge; give triangles instead of quadrilaterals beside volumes$"):
+        trajectory(**shape, cells={"quadrilateral": [[0, 1, 2, 3]], "wedge": [[0, 1, 2, 3, 4, 5]]})
     assert [trajectory(**shape, cells={kind: [[0, 1, 2, 3]]}).cell_dim for kind in ("quadrilateral", "tetrahedron")] == [2, 3]
 
 

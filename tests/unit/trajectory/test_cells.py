@@ -4,19 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from gpe_pl.graphs.builder import GraphBuilder, GraphError
+from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.approximate import Sleeping
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics.deformation import strain_energy
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.trajectory.cells import bodies, is_corner, mean_over_corners
+from gpe_pl.schema import CELL_KINDS
+from gpe_pl.trajectory.cells import bodies, cell_edges, is_corner, kinds_of, mean_over_corners
 from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.store import read_trajectory, write_shard
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.trajectory.values import faults
+from gpe_pl.viz.panel import drawn_faces
 from tests import scenes
 
 MIXED = np.array([[0, 1, 2, 3], [1, 4, 5, 5]])
@@ -62,7 +70,11 @@ def test_predicted_stress_does_not_depend_on_how_cells_are_stored(asleep: bool) 
         ([0, 0, 1, 2], 2, False),
         ([0, 1, 1, 2, 3, 3, 3, 3], 3, False),
         ([0, 1, 2, 3, 3, 3, 3, 3], 3, True),
-        ([0, 1, 1, 1], 2, False),
+        ([0, 1, 1, 1], 2, True),
+        ([0, 0, 0, 0], 2, False),
+        ([0, 1, 2, 3, 4, 5], 3, True),
+        ([0, 1, 2, 3, 4, 5, 5, 5], 3, True),
+        ([0, 1, 2, 3, 4, 5], 2, False),
         ([0, 1, 2, 3, 4], 2, False),
         ([0, 1, 2, 3, 4, 5, 6, 7], 2, False),
         ([0, 1, 2, 3, 4, 5, 6, 7], 3, True),
@@ -75,7 +87,7 @@ def test_a_stored_row_that_is_no_cell_is_a_fault(cell: list[int], dim: int, is_s
     assert all("triangle" in str(fault) and str(cell) in str(fault) for fault in found)
 
 
-@pytest.mark.parametrize(("dim", "cell_dim", "allowed"), [(2, 0, "2"), (2, 3, "2"), (3, 7, "2 or 3")])
+@pytest.mark.parametrize(("dim", "cell_dim", "allowed"), [(2, 0, "1 or 2"), (2, 3, "1 or 2"), (3, 7, "1, 2 or 3")])
 def test_dimensions_that_no_cell_has(dim: int, cell_dim: int, allowed: str) -> None:
     arrays: dict[str, np.ndarray] = {
         "pos": np.zeros((3, 8, dim)),
@@ -85,6 +97,54 @@ def test_dimensions_that_no_cell_has(dim: int, cell_dim: int, allowed: str) -> N
     }
     (found,) = [str(fault) for fault in faults(arrays, ["elastomer"], ["elastomer"], []) if fault.field == "cell_dim"]
     assert found.endswith(f"is {cell_dim}, must be {allowed} in {dim}D")
+
+
+def mixed() -> Trajectory:
+    """Return two bodies of all kinds of cells in space but quadrilaterals, which move."""
+    random = np.random.default_rng(0)
+    pos = random.uniform(0.2, 0.8, (1, 20, 3)) + np.cumsum(random.normal(scale=1e-3, size=(8, 20, 3)), axis=0)
+    kinds = {
+        "hexahedron": [[0, 1, 2, 3, 4, 5, 6, 7]],
+        "wedge": [[1, 2, 8, 5, 6, 9]],
+        "tetrahedron": [[2, 8, 6, 10]],
+        "triangle": [[11, 12, 13]],
+        "line": [[13, 14], [8, 15]],
+    }
+    return Trajectory.from_numpy(pos, 0.01, "elastomer", {"elastomer": 1e5}, spacing=0.1, cells=kinds, bounds=((0.0, 1.0),) * 3)
+
+
+def test_a_mesh_of_many_kinds_is_stored_and_connected(tmp_path: Path) -> None:
+    write_shard(tmp_path / "a.h5", [mixed()])
+    found = read_trajectory(tmp_path / "a.h5", "00000", verify=True)
+    assert found.cell_dim == 3 and found.cells is not None
+    names = [list(CELL_KINDS)[k] for k in kinds_of(found.cells, 3, 3)]
+    assert names == ["hexahedron", "wedge", "tetrahedron", "triangle", "line", "line"]
+    edges = {tuple(edge) for edge in cell_edges(found.cells.astype(np.int64), 20).T.tolist()}
+    assert {(13, 14), (8, 15), (2, 10)} <= edges and (14, 15) not in edges and (0, 8) not in edges
+    assert [own.tolist() for own in bodies(found.cells, 20)] == [[*range(11), 15], [11, 12, 13, 14]]
+    assert strain_energy(found) is None
+
+
+def test_a_model_moves_a_mesh_of_many_kinds() -> None:
+    whole = mixed()
+    build = GraphBuilder(GraphConfig(history=2, mesh=True, islands=True), whole.metadata)
+    simulator = LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=8), build).eval()
+    state = simulator.initial_state(whole, 2)
+    assert torch.isfinite(simulator.step(state).pos).all()
+    cells = GraphBuilder(GraphConfig(history=2, mesh=True, islands=True, cells=True), whole.metadata)
+    with pytest.raises(GraphError, match="needs tetrahedra or hexahedra, this mesh mixes them or has others"):
+        cells(state)
+    wedges = replace(state, cells=state.cells[1:2, :6])  # type: ignore[index]
+    with pytest.raises(GraphError, match="needs tetrahedra or hexahedra, this mesh mixes them or has others"):
+        cells(wedges)
+
+
+def test_pictures_show_outer_faces_of_volumes_and_all_other_cells() -> None:
+    faces, of_cell = drawn_faces(mixed())
+    shown = {(cell, frozenset(face.tolist())) for face, cell in zip(faces, of_cell, strict=True)}
+    assert (1, frozenset({1, 2, 6, 5})) not in shown and (0, frozenset({1, 2, 6, 5})) not in shown  # between hexahedron and wedge
+    assert (1, frozenset({1, 2, 8})) in shown and (2, frozenset({2, 8, 10})) in shown
+    assert (3, frozenset({11, 12, 13})) in shown and (4, frozenset({13, 14})) in shown
 
 
 def test_bodies_are_the_nodes_that_cells_connect() -> None:
