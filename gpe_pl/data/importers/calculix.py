@@ -3,16 +3,16 @@
 ``source`` is a folder with ``train/``, ``val/``, ``test/`` and ``test_unseen/``, or a folder of files. Each trajectory is a deck ``NAME.inp`` and its results
 ``NAME.frd``. The deck has one ``*STEP`` with ``*DYNAMIC, DIRECT``, ``*NODE FILE`` with ``U`` and, for stresses, ``*EL FILE`` with ``S``, each for every frame.
 
-| of the deck or results | becomes |
-|---|---|
-| nodes; displacements ``U`` | positions; the undeformed positions are those before the step |
-| velocities ``V`` | velocities at the frames; without them, differences of positions |
-| ``S`` | stress at nodes |
-| linear solid elements C3D4, C3D6 and C3D8, and their materials | cells; nodes of ``solid``, or as ``materials={1: elastomer}`` says by number |
-| ``*ELASTIC``, ``*DENSITY`` | Young's modulus, Poisson's ratio, masses of nodes: a cell gives each corner an equal part of its mass |
-| ``*BOUNDARY`` along all axes, with or without a motion | nodes whose motion is given |
-| ``*CLOAD`` with its amplitude | forces on nodes: of a frame, the mean of the force at its two ends |
-| ``*DLOAD`` with ``GRAV`` | gravity |
+What becomes of the deck and the results:
+
+- Nodes and displacements ``U`` become positions. The undeformed positions are those before the step.
+- Velocities ``V`` become velocities at the frames. Without them, velocities are differences of positions.
+- ``S`` becomes the stress at nodes.
+- Linear solid elements C3D4, C3D6 and C3D8 become cells, and their nodes are ``solid``, or as ``materials={1: elastomer}`` says by number of the material.
+- ``*ELASTIC`` and ``*DENSITY`` become Young's modulus, Poisson's ratio and masses of nodes. A cell gives each corner an equal part of its mass.
+- ``*BOUNDARY`` along all axes, with or without a motion, becomes nodes whose motion is given.
+- ``*CLOAD`` with its amplitude becomes forces on nodes. The force of a frame is the mean of the forces at its two ends.
+- ``*DLOAD`` with ``GRAV`` becomes gravity.
 
 Units are those of the deck, which have to be SI units. The first frame is the time before the first result, in which everything is at rest and free of stress.
 Nodes that are held along some axes only are computed like free nodes, and a warning says so.
