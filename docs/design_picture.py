@@ -19,8 +19,8 @@ from gpe_pl.viz.film_strip import new_figure
 from gpe_pl.viz.saving import save_figure
 
 IMAGES = Path(__file__).parent / "images"
-TARGET = (0.6, 0.15)
-SECONDS, SHIFT, ANGLE = 0.3, 0.03, 30.0
+TARGET = (0.45, 0.3)
+SECONDS, SHIFT, ANGLE = 0.15, 0.03, 30.0
 GRADIENTS = 8
 """Largest number of gradients. The derivative-free search gets as many rollouts as cost the same processor time."""
 RAMP = Polygon(((0.17, 0.28), (0.37, 0.28), (0.37, 0.32), (0.17, 0.32)), 0.3)
