@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count, islice
 from pathlib import Path
 from typing import Any
@@ -86,7 +86,7 @@ class Predictor:
     stride: int
     start_frame: int
     seconds: list[float]
-    bars: Bars = no_bar
+    bars: Bars = field(default_factory=lambda: no_bar)
 
     def scenes(self, root: Path, split: Split) -> Iterator[PredictedScene]:
         """Yield the first ``settings.num_trajectories`` scenes of a split, in its order."""

@@ -372,7 +372,7 @@ class Trajectory:
 
     @property
     def is_predicted(self) -> np.ndarray:
-        """Mask [node] of the nodes that simulators compute: those whose motion is not given."""
+        """Mask of the nodes that simulators compute, whose motion is not given [node]."""
         return np.ones(self.num_nodes, bool) if self.prescribed is None else ~self.prescribed
 
     def loads_at(self, frame: int) -> Loads | None:
