@@ -277,6 +277,7 @@ def _claimed(cfg: DictConfig) -> dict[str, Any]:
     from omegaconf import OmegaConf
 
     values: Any = OmegaConf.to_container(cfg, resolve=True)
+    del values["evaluation"]["quantities"]  # changes no metric
     return {k: values[k] for k in ("seed", "size", "data", "graph", "batching", "model", "training", "evaluation")}
 
 

@@ -234,9 +234,10 @@ def test_examples_of_the_guide_are_scenes(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(Scene, "_film", lambda scene, *_, **__: Seen(scene))
     for page in (guide, readme):
-        (code,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Scene(" in block)
-        exec(code, {})
-    assert [scene.state(model("sand"))[0].num_nodes > 100 for scene in shown] == [True, True]
+        names: dict[str, Any] = {}
+        for code in (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Scene(" in block):
+            exec(code, names)
+    assert [scene.state(model("fluid" if scene.zones else "sand"))[0].num_nodes > 100 for scene in shown] == [True, True, True]
 
 
 @pytest.mark.slow

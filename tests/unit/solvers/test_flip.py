@@ -204,7 +204,7 @@ def test_fields_are_empty_after_a_substep():
     flip, state = solver(), liquid()
     fields = Fields.empty(flip.grid)
     pos, vel = state.pos.copy(), state.vel.copy()
-    flip._advance(pos, vel, state.mass, state.material_params[:, 0].copy(), state.gravity, 5e-3, flip.solids(state.boundary), fields)
+    flip._advance(pos, vel, state.mass, state.material_params[:, 0].copy(), state.gravity, 5e-3, flip.solids(state.boundary), fields, None)
     for name, value in vars(Fields.empty(flip.grid)).items():
         if name != "island":
             np.testing.assert_array_equal(getattr(fields, name), value, err_msg=name)

@@ -208,8 +208,8 @@ def test_an_archive_that_blows_up(tmp_path: Path) -> None:
         ({"boundary_normal": [[0, 1]]}, "has boundary arrays but no 'boundary_pos'"),
         ({"boundary_pos": [[0, 1]], "boundary_normal": [[0, 0]]}, "boundary normal: boundary_node 0 has length 0"),
         ({"cells": [[0, 1, 2]]}, "cell 0 has nodes of sand"),
-        ({"cells_pentagon": [[0, 1, 2, 3, 4]]}, "cells: unknown kind 'pentagon'; in 2D there are triangle, quadrilateral"),
-        ({"cells_tetrahedron": [[0, 1, 2, 3]]}, "cells: unknown kind 'tetrahedron'; in 2D there are triangle, quadrilateral"),
+        ({"cells_pentagon": [[0, 1, 2, 3, 4]]}, "cells: unknown kind 'pentagon'; in 2D there are line, triangle, quadrilateral"),
+        ({"cells_tetrahedron": [[0, 1, 2, 3]]}, "cells: unknown kind 'tetrahedron'; in 2D there are line, triangle, quadrilateral"),
         ({"cells_quadrilateral": [[0, 1, 2, 2]]}, r"cell 0 has the nodes \[0, 1, 2, 2\]; they must be different ones"),
     ],
 )

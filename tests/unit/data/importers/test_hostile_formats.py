@@ -59,7 +59,7 @@ def test_remeshing_is_refused(tmp_path: Path) -> None:
     [
         ({"cells": np.full((1, 4, 3), 99, np.int32)}, "cells name node 99, there are 30 nodes"),
         ({"cells": np.full((1, 4, 3), 7.0, np.float32)}, "cells are .*expected integers|cells name node 1088421888"),
-        ({"cells": np.full((1, 4, 3), 7, np.int32)}, r"cell 0 has the nodes \[5, 5, 5\]; they must be different ones of the 28 nodes"),
+        ({"cells": np.full((1, 4, 3), 7, np.int32)}, r"cell 0 has the nodes \[7, 7, 7\]; they must be different ones of the 30 nodes"),
         ({"world_pos": sources.sheet()["world_pos"][:, :7]}, "world_pos, mesh_pos and node_type are|no whole number of 30 × 3 × 4 bytes"),
         ({"world_pos": sources.sheet()["world_pos"][:2]}, "at least 3 frames"),
         ({"node_type": np.full((1, 30, 1), 4, np.int32)}, "node 0 has type 4; known: 0, 1, 3, 6"),
