@@ -233,7 +233,9 @@ def test_a_page_of_another_model_is_refused_before_the_rollouts(tiny_data: Path,
 
 
 def test_an_unknown_format_is_refused(tiny_data: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"evaluation\.export\.0='vtu': must be 'vtk', 'npz', 'mp4', 'svg', 'pdf', 'model', 'onnx' or 'page'"):
+    with pytest.raises(
+        ConfigError, match=r"evaluation\.export\.0='vtu': must be 'vtk', 'npz', 'mp4', 'svg', 'pdf', 'model', 'onnx' or 'page'"
+    ):
         evaluate(tiny_data, tmp_path, "x.ckpt", "evaluation.export=[vtu]")
 
 
