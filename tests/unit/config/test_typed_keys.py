@@ -10,6 +10,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
+import gpe_pl.config.entry_point  # noqa: F401 registers plugins and resolvers that files in conf/ use
 from gpe_pl.config.folder import CONF
 from gpe_pl.config.typed_keys import without_effect
 from gpe_pl.files.run_folder import without_tables
@@ -67,5 +68,5 @@ def test_with_the_papers_recipe_too_an_axis_changes_something_or_is_refused(expe
         if not without_effect(cfg, overrides):
             values: Any = OmegaConf.to_container(cfg, resolve=True)
             kept = without_tables(values)
-            runs.append([kept[key] for key in ("data", "graph", "model", "training")])
+            runs.append([kept[key] for key in ("data", "graph", "model", "training")] + [values["start_from"]])
     assert all(run not in runs[:k] for k, run in enumerate(runs))
