@@ -2,7 +2,7 @@
 
 ``export.program`` writes a program that Python loads. This module compiles it with PyTorch's AOTInductor for the processor of this machine. The package takes
 and returns the same tensors, in the order of ``export.program.describe``: inputs as ``scene_of`` returns them; outputs as positions and velocity histories of
-each material, then accelerations and stresses. ``examples/cpp`` has a caller. Compiling takes about a minute and needs a C++ compiler.
+each material, then accelerations and stresses. ``docs/cpp`` has a caller. Compiling takes about a minute and needs a C++ compiler.
 """
 
 from __future__ import annotations

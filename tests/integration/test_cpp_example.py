@@ -20,7 +20,7 @@ from gpe_pl.rollout.loop import rollout
 from tests import scenes
 from tests.unit.export.test_program import simulator
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "cpp"
+EXAMPLE = Path(__file__).parents[2] / "docs" / "cpp"
 NUM_STEPS = 6
 
 

@@ -1,7 +1,7 @@
 """Writes what ``rollout.cpp`` reads: the compiled model and the start of a scene.
 
-    python examples/cpp/prepare.py sand build
-    cmake -S examples/cpp -B build -DCMAKE_PREFIX_PATH=$(python -c "import torch; print(torch.utils.cmake_prefix_path)")
+    python docs/cpp/prepare.py sand build
+    cmake -S docs/cpp -B build -DCMAKE_PREFIX_PATH=$(python -c "import torch; print(torch.utils.cmake_prefix_path)")
     cmake --build build
     build/rollout build/model.pt2 build/scene.pt 100 build/positions.bin
 
