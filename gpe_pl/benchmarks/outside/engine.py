@@ -1,6 +1,13 @@
-"""What the modules of other engines share: their error, and the last lines of their output."""
+"""What the modules of other engines share: how their programs run, and the error if one fails."""
 
 from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
 
 from gpe_pl.errors import GpeError
 
@@ -12,3 +19,29 @@ class EngineError(GpeError, RuntimeError):
 def last_lines(text: str, count: int = 4) -> str:
     """Return the last lines of a text that are not empty, on one line."""
     return " / ".join([line.strip() for line in text.splitlines() if line.strip()][-count:])
+
+
+def output_of(engine: str, command: Sequence[str], folder: Path, seconds: int) -> str:
+    """Run the program of an engine in a folder, and return what it printed and how it ended.
+
+    Raises:
+        EngineError: the program took longer than ``seconds``.
+    """
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, encoding="utf-8", errors="replace", timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:
+        raise EngineError(f"{engine}: took longer than {seconds} s") from None
+    return f"{done.stdout}{done.stderr}\nended with status {done.returncode}"
+
+
+def frames_of(engine: str, module: str, folder: Path, num_frames: int, seconds: int) -> np.ndarray:
+    """Return the array that a module of this package stores as ``frames.npy`` in a folder, when it runs as a program of its own.
+
+    Raises:
+        EngineError: the program stored nothing, or took longer than ``seconds``.
+    """
+    said = output_of(engine, [sys.executable, "-m", module, str(folder), str(num_frames)], Path.cwd(), seconds)
+    stored = folder / "frames.npy"
+    if not stored.is_file():
+        raise EngineError(f"{engine}: stored no frames; its last lines are: {last_lines(said)}")
+    return np.asarray(np.load(stored))

@@ -10,7 +10,6 @@ import importlib
 import importlib.util
 import json
 import math
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl.benchmarks.outside.engine import EngineError, last_lines
+from gpe_pl.benchmarks.outside.engine import EngineError, frames_of
 from gpe_pl.solvers.materials import Sand
 from gpe_pl.trajectory.state import State
 
@@ -59,20 +58,7 @@ def run(state: State, sand: Sand, bounds: tuple[tuple[float, float], ...], spaci
         (folder / "grid.mdpa").write_text(_grid(bounds, PARTICLES_PER_CELL * spacing), encoding="ascii")
         (folder / "materials.json").write_text(json.dumps(_materials(sand, float(state.material_params[0, 0]))), encoding="ascii")
         (folder / "parameters.json").write_text(json.dumps(_parameters(state, frame_dt, num_frames)), encoding="ascii")
-        try:
-            done = subprocess.run(
-                [sys.executable, "-m", __name__, name, str(num_frames)],
-                capture_output=True,
-                encoding="utf-8",
-                errors="replace",
-                timeout=SECONDS,
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
-            raise EngineError(f"Kratos: took longer than {SECONDS} s") from None
-        if not (folder / "frames.npy").is_file():
-            raise EngineError(f"Kratos: ended with status {done.returncode}; its last lines are: {last_lines(done.stdout + done.stderr)}")
-        frames = np.load(folder / "frames.npy")
+        frames = frames_of("Kratos", __name__, folder, num_frames, SECONDS)
     if frames.shape != (num_frames, state.num_nodes, 2):
         raise EngineError(
             f"Kratos: has frames and nodes {frames.shape[:2]}, expected {(num_frames, state.num_nodes)}: particles left the grid"

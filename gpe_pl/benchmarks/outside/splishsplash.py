@@ -11,7 +11,6 @@ import ctypes
 import importlib.util
 import json
 import struct
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl.benchmarks.outside.engine import EngineError, last_lines
+from gpe_pl.benchmarks.outside.engine import frames_of
 from gpe_pl.trajectory.state import State
 
 MODULE = "pysplishsplash"
@@ -64,16 +63,7 @@ def run(state: State, bounds: tuple[tuple[float, float], ...], spacing: float, f
         (folder / "scene.json").write_text(json.dumps(_scene(state, spacing, frame_dt)), encoding="ascii")
         (folder / "start.bgeo").write_bytes(points_file(state.pos))
         np.save(folder / "vel.npy", state.vel)
-        command = [sys.executable, "-m", __name__, name, str(num_frames)]
-        try:
-            done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", timeout=SECONDS, check=False)
-        except subprocess.TimeoutExpired:
-            raise EngineError(f"SPlisHSPlasH: took longer than {SECONDS} s") from None
-        if not (folder / "frames.npy").is_file():
-            raise EngineError(
-                f"SPlisHSPlasH: ended with status {done.returncode}; its last lines are: {last_lines(done.stdout + done.stderr)}"
-            )
-        return np.load(folder / "frames.npy")
+        return frames_of("SPlisHSPlasH", __name__, folder, num_frames, SECONDS)
 
 
 def _scene(state: State, spacing: float, frame_dt: float) -> dict[str, Any]:
