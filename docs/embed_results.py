@@ -43,7 +43,7 @@ PICTURES = (
 )
 FILM = "rollout_test_00.gif"
 MAX_WIDTH = 1400
-MAX_JSON = 65_536
+MAX_BYTES = 65_536
 NUM_COLORS = 128
 
 
@@ -81,9 +81,9 @@ def collect(run: Path, name: str, note: str = "") -> None:
 
 
 def record(source: Path, folder: Path) -> None:
-    """Copy a file to a folder. JSON files of more than ``MAX_JSON`` bytes, which nobody reads as text, are compressed with xz."""
+    """Copy a file to a folder. JSON and CSV files of more than ``MAX_BYTES`` bytes, which nobody reads as text, are compressed with xz."""
     content = source.read_bytes()
-    is_long = source.suffix == ".json" and len(content) > MAX_JSON
+    is_long = source.suffix in (".json", ".csv") and len(content) > MAX_BYTES
     target = folder / source.name
     packed = target.with_name(f"{target.name}.xz")
     (target if is_long else packed).unlink(missing_ok=True)  # of an earlier run

@@ -53,16 +53,17 @@ def test_a_packed_folder_can_be_checked(tmp_path: Path, capsys: pytest.CaptureFi
     assert pack([str(tmp_path / "nothing"), str(tmp_path / "c.tar.xz")]) == 2
 
 
-def test_long_records_are_compressed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["results.json", "table1.csv"])
+def test_long_records_are_compressed(name: str, tmp_path: Path) -> None:
     record = runpy.run_path(str(ROOT / "docs" / "embed_results.py"))["record"]
-    source, target = tmp_path / "results.json", tmp_path / "target"
+    source, target = tmp_path / name, tmp_path / "target"
     target.mkdir()
-    for length, name in ((70_000, "results.json.xz"), (10, "results.json")):  # the second takes the place of the first
+    for length, copied in ((70_000, f"{source.name}.xz"), (10, source.name)):  # the second takes the place of the first
         source.write_text(json.dumps("1" * length))
         record(source, target)
-        assert [path.name for path in target.iterdir()] == [name]
-        opened = lzma.open if name.endswith("xz") else open
-        with opened(target / name, "rb") as file:
+        assert [path.name for path in target.iterdir()] == [copied]
+        opened = lzma.open if copied.endswith("xz") else open
+        with opened(target / copied, "rb") as file:
             assert file.read() == source.read_bytes()
 
 
