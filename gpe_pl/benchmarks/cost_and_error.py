@@ -48,6 +48,21 @@ class Point:
         return float(np.median(self.seconds))
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """All simulators of a case, on the same scenes.
+
+    Attributes:
+        points: cost and error of each simulator.
+        order: observed order of convergence of the reference.
+        partial: solvers that are left out, because a scene does not exist at their resolution, and the number of scenes that they have.
+    """
+
+    points: list[Point]
+    order: float
+    partial: dict[str, int] = field(default_factory=dict)
+
+
 def front(points: Sequence[Point], horizon: str) -> list[Point]:
     """Return the Pareto front: the points that no other point beats in both cost and error, from the cheapest on."""
     best: list[Point] = []

@@ -9,6 +9,7 @@ import numpy as np
 
 from gpe_pl.benchmarks.cost_and_error import (
     WINNING_HORIZONS,
+    Comparison,
     Point,
     break_even,
     cost_at_error,
@@ -72,15 +73,15 @@ def _times(ratios: Sequence[float]) -> str:
     return ", ".join(f"{ratio:.2g}" for ratio in ratios)
 
 
-def section(case: str, points: Sequence[Point], order: float, num_trajectories: int) -> str:
+def section(case: str, comparison: Comparison, num_trajectories: int) -> str:
     """Return the section of a case: errors and times of all simulators, and where learned models win or lose.
 
     Args:
         case: name of the case.
-        points: all simulators.
-        order: observed order of convergence of the reference.
+        comparison: all simulators.
         num_trajectories: number of scenes.
     """
+    points = comparison.points
     horizons = [*points[0].mse]
     solvers = [p for p in points if p.family == "solver"]
     header = ["", "time per simulated second", *(f"MSE @{h}" for h in horizons), "energy distance [mm]"]
@@ -92,12 +93,15 @@ def section(case: str, points: Sequence[Point], order: float, num_trajectories: 
         lines.append(table_row([point.name, f"{point.cost:.3g}", *cells, f"{1e3 * np.mean(point.distance):.3g}"]))
     note = (
         f"{num_trajectories} scenes. MSE ×1e-3 [m²] to the solver at half the spacing of the data's, whose observed order of convergence is "
-        f"{order:.1f} (positions, first 20 frames): mean and 95 % interval over scenes. `{DATA}` is the error in the "
+        f"{comparison.order:.1f} (positions, first 20 frames): mean and 95 % interval over scenes. `{DATA}` is the error in the "
         "training data. Times: processor time of one core, warm, neighbour search and features included. Those of learned models include the solver "
         "that computes the frames before their first."
     )
     if len(shown) < len(points):
         note += f" Of the solvers, {len(points) - len(shown)} are only in `results.json`: at each horizon, another one is at least as fast and as accurate."
+    if comparison.partial:
+        counts = ", ".join(f"{name} ({num_scenes})" for name, num_scenes in comparison.partial.items())
+        note += f" Left out, because they cannot solve all of the scenes (number of scenes that they solve): {counts}."
     lost = ["", *_ratios(points, horizons), "", "**Where the learned models lose**: time of a solver of the same error over theirs", ""]
     lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
     for point in (p for p in points if p.family == "learned"):

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from gpe_pl.benchmarks.cost_and_error import Family, Point, break_even, cost_at_error, hypervolume, paired_ratio, ratio_at_cost
+from gpe_pl.benchmarks.cost_and_error import Comparison, Family, Point, break_even, cost_at_error, hypervolume, paired_ratio, ratio_at_cost
 from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
 from gpe_pl.benchmarks.ladder_tables import BALLISTIC, REPEATED, of_own_moduli, section, summary
 from gpe_pl.benchmarks.reference_solutions import REFERENCES, ComparisonError, observed_order, stored_reference
@@ -139,14 +139,14 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
                 f"{' and '.join([*settings.runs, *settings.checkpoints])}: no finished run that was trained on the data set {spec.name!r} of size "
                 f"{spec.size!r}; train with `python -m gpe_pl.fit experiment=table1 size={spec.size}`, or set suite.runs or suite.checkpoints"
             )
-    results: dict[str, tuple[list[Point], float]] = {}
+    results: dict[str, Comparison] = {}
     for name, spec in specs.items():
         log.info("%s: %d models", name, len(entrants[name]))
-        points, order = results[name] = compare(spec, entrants[name], settings, folder, name)
-        records += [{**record, "seed": spec.seed} for record in _records(name, points, order)]
+        found = results[name] = compare(spec, entrants[name], settings, folder, name)
+        records += [{**record, "seed": spec.seed} for record in _records(name, found.points, found.order)]
     FinishedParts(folder / PARTS).clear()
-    sections = [section(name, points, order, settings.num_trajectories) for name, (points, order) in results.items()]
-    return records, "\n\n".join([summary({name: points for name, (points, _) in results.items()}), *sections])
+    sections = [section(name, found, settings.num_trajectories) for name, found in results.items()]
+    return records, "\n\n".join([summary({name: found.points for name, found in results.items()}), *sections])
 
 
 def _entrants(finished: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[str, Entrant]:
@@ -176,10 +176,8 @@ def _teacher(labels: Labels, spec: DatasetSpec) -> str:
     return base if labels.softness == 1 else f"{base}, {MODULI}{labels.softness:g}"
 
 
-def compare(
-    spec: DatasetSpec, entrants: dict[str, Entrant], settings: Settings, folder: Path | None = None, case: str = ""
-) -> tuple[list[Point], float]:
-    """Run all simulators on the same scenes; return their points and the solver's observed order of convergence.
+def compare(spec: DatasetSpec, entrants: dict[str, Entrant], settings: Settings, folder: Path | None = None, case: str = "") -> Comparison:
+    """Run all simulators on the same scenes.
 
     Args:
         spec: the data set.
@@ -210,11 +208,15 @@ def compare(
                 for horizon, error in record["mse"].items():
                     point.mse.setdefault(horizon, []).append(_number(error, math.inf))
         on_progress(settings.num_trajectories, settings.num_trajectories)
+    partial = {name: len(point.seconds) for name, point in points.items() if len(point.seconds) < settings.num_trajectories}
+    for name, num_scenes in partial.items():
+        log.warning("%s: %s is left out, because it has %d of %d scenes", case, name, num_scenes, settings.num_trajectories)
+        del points[name]  # means over other scenes do not compare
     rates: dict[int, float] = {spec.fine: points[DATA].cost, 1: points[_nodes(spec)].cost}
     for label, entrant in entrants.items():
         points[label].overhead = entrant.spent.seconds(rates, float(getattr(spec.scene, "num_particles", math.nan)))
         points[label].teacher = entrant.teacher
-    return [*points.values()], float(np.nanmedian(orders))
+    return Comparison([*points.values()], float(np.nanmedian(orders)), partial)
 
 
 def _first_frame(spec: DatasetSpec, entrants: dict[str, Entrant]) -> int:

@@ -12,6 +12,7 @@ import torch
 
 from gpe_pl.benchmarks import runtime_vs_error as module
 from gpe_pl.benchmarks.cost_and_error import (
+    Comparison,
     Family,
     Point,
     break_even,
@@ -128,22 +129,22 @@ def untrained(stride: int = 1) -> LearnedSimulator:
 def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
     settings = Settings({}, [], factors=[2.0], step_factors=[2], num_trajectories=1, horizons=[10])
-    points, order = compare(spec, {"GPE 1 × 8": Entrant(untrained(), Spent(60.0, (Simulated(1, 150.0, 10.0),)))}, settings)
-    by_name = {p.name: p for p in points}
+    found = compare(spec, {"GPE 1 × 8": Entrant(untrained(), Spent(60.0, (Simulated(1, 150.0, 10.0),)))}, settings)
+    by_name = {p.name: p for p in found.points}
     assert {DATA, "GPE 1 × 8", "ballistic", "stops at walls", "constant velocity"} < set(by_name)
     assert by_name[DATA].error("10") < by_name["solver, spacing × 2"].error("10") < by_name["constant velocity"].error("10")
     assert by_name[DATA].error("10") < by_name["solver, steps × 2"].error("10") < by_name["constant velocity"].error("10")
     assert by_name["solver, steps × 2"].error("10") < by_name["solver, spacing × 2, steps × 2"].error("10")
-    assert all(p.cost > 0 and set(p.mse) == {"10", "full"} for p in points)
+    assert all(p.cost > 0 and set(p.mse) == {"10", "full"} for p in found.points)
     assert by_name["GPE 1 × 8"].overhead == pytest.approx(60.0 + 10 * by_name[DATA].cost)
-    assert np.isfinite(order)
+    assert np.isfinite(found.order) and not found.partial
 
 
 def test_a_model_with_longer_frames_starts_with_the_others_and_is_seen_at_all_frames() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
     models = {"every": Entrant(untrained(), Spent(0.0)), "third": Entrant(untrained(3), Spent(0.0))}  # before training they fall freely
-    points, _ = compare(spec, models, Settings({}, [], factors=[], step_factors=[], soft_factors=[], num_trajectories=1, horizons=[9]))
-    by_name = {p.name: p for p in points}
+    found = compare(spec, models, Settings({}, [], factors=[], step_factors=[], soft_factors=[], num_trajectories=1, horizons=[9]))
+    by_name = {p.name: p for p in found.points}
     assert by_name["third"].error("9") == pytest.approx(by_name["every"].error("9"), rel=0.3)
     assert np.isfinite(by_name["third"].error("full")) and set(by_name["third"].mse) == {"9", "full"}
 
@@ -160,8 +161,8 @@ def test_models_of_finer_labels_start_where_the_solver_at_their_own_spacing_is(m
 
     monkeypatch.setattr(module, "timed", fake)
     settings = Settings({}, [], factors=[], step_factors=[], soft_factors=[], num_trajectories=1, horizons=[9])
-    points, _ = compare(spec, {"model": Entrant(untrained(), Spent(0.0))}, settings)
-    by_name = {p.name: p for p in points}
+    found = compare(spec, {"model": Entrant(untrained(), Spent(0.0))}, settings)
+    by_name = {p.name: p for p in found.points}
     assert {DATA, NODES} < set(by_name)
     plain = generate_trajectory(replace(spec, fine=1), "test_unseen", 0, num_frames=3)
     (at,) = (at for simulator, at in seen if isinstance(simulator, Contained))
@@ -213,7 +214,7 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
     for p in points:
         p.distance = [1e-3]
     monkeypatch.setattr(module, "_entrants", lambda *_: {"model": None})
-    monkeypatch.setattr(module, "compare", lambda *_: (points, 1.3))
+    monkeypatch.setattr(module, "compare", lambda *_: Comparison(points, 1.3))
     records, table = run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec}, tmp_path)
     assert "| model | **1.3** |" in table and "| slow model | 0.15 |" in table
     assert "| slow model | never |" in table
@@ -271,12 +272,31 @@ def test_a_stopped_comparison_continues_scene_by_scene(monkeypatch: pytest.Monke
     with pytest.raises(KeyboardInterrupt):
         compare(spec, entrants, settings, tmp_path)
     stop_at = -1
-    points, order = compare(spec, entrants, settings, tmp_path)
-    assert ran == [0, 1, 2] and order == 1.5
-    (model,) = (p for p in points if p.family == "learned")
+    found = compare(spec, entrants, settings, tmp_path)
+    assert ran == [0, 1, 2] and found.order == 1.5
+    (model,) = (p for p in found.points if p.family == "learned")
     assert (model.seconds, model.mse["full"], model.teacher) == ([1.0, 2.0, 3.0], [1e-3, float("inf"), 1e-3], "teacher")
     compare(spec, entrants, replace(settings, factors=[2.5]), tmp_path)  # other solvers: nothing of the above counts
     assert ran == [0, 1, 2, 0, 1, 2]
+
+
+def test_a_solver_that_lacks_a_scene_is_left_out_of_all_comparisons(monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+
+    def scene(spec: Any, index: int, *_: Any) -> list[dict[str, Any]]:
+        simulators = [(DATA, "solver", 4.0, 1e-4), ("model", "learned", 1.0, 1e-2), ("ballistic", "trivial", 0.1, 0.1)]
+        if index:
+            simulators.append(("solver, spacing × 2", "solver", 0.5, 1e-3))
+        return [{"order": 1.0}] + [
+            {"simulator": name, "family": family, "seconds": seconds, "mse": {"full": error}, "distance": error}
+            for name, family, seconds, error in simulators
+        ]
+
+    monkeypatch.setattr(module, "_scene", scene)
+    found = compare(spec, {"model": Entrant(untrained(), Spent(0.0))}, Settings({}, [], num_trajectories=3))
+    assert [p.name for p in found.points] == [DATA, "model", "ballistic"] and found.partial == {"solver, spacing × 2": 2}
+    assert all(len(record.get("values", "123")) == 3 for record in module._records("sand", found.points, found.order))
+    assert "solver, spacing × 2 (2)" in section("sand", found, 3)
 
 
 def test_a_reference_is_computed_once_for_each_scene_and_solver(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -360,11 +380,11 @@ def test_emulator_superiority_is_against_the_solver_of_the_labels() -> None:
     model = Point("model", "learned", [1.0], {"full": [2 * s for s in scenes]}, teacher=NODES)
     for p in (data, teacher, model):
         p.distance = [1e-3]
-    text = section("snow", [data, teacher, model], 1.0, 3)
+    text = section("snow", Comparison([data, teacher, model], 1.0), 3)
     assert "| model | solver of its labels | **0.50 [0.50, 0.50]** |" in text
     assert "solver of its labels): model (@full): the interval lies below 1." in text
     model.teacher = DATA
-    assert "solver of its labels): no model is, at any horizon." in section("snow", [data, teacher, model], 1.0, 3)
+    assert "solver of its labels): no model is, at any horizon." in section("snow", Comparison([data, teacher, model], 1.0), 3)
 
 
 def test_a_scene_that_is_too_short_for_a_model_is_refused() -> None:
