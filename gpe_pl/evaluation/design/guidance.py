@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpe_pl.evaluation.checkpointed import Checkpointed
 from gpe_pl.evaluation.design.pose import NAMES, Obstacle
-from gpe_pl.evaluation.identification.shooting import Checkpointed
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import Simulator, step_scenes
 from gpe_pl.trajectory.state import State

@@ -16,13 +16,13 @@ import torch
 from jaxtyping import Float64
 from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
-from torch.utils.checkpoint import checkpoint
 
 from gpe_pl.errors import GpeError
+from gpe_pl.evaluation.checkpointed import Checkpointed
 from gpe_pl.evaluation.identification.observations import Observations
 from gpe_pl.evaluation.identification.unknowns import Unknowns
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.rollout.loop import Restartable, SimulationError, Simulator, step_scenes
+from gpe_pl.rollout.loop import Restartable, Simulator, step_scenes
 from gpe_pl.trajectory.state import State
 
 FLOOR = 1e-6
@@ -49,21 +49,6 @@ class ShootingSettings:
     horizon: Annotated[int, Field(ge=1)] = 20
     num_windows: Annotated[int, Field(ge=1)] = 6
     single_frames: Annotated[int, Field(ge=1)] = 100
-
-
-class Checkpointed:
-    """A learned simulator whose steps keep no activations for gradients: the backward pass computes each step again. Memory is then one step's, and one state
-    per frame.
-    """
-
-    def __init__(self, simulator: LearnedSimulator) -> None:
-        self.simulator = simulator
-
-    def step(self, state: State) -> Any:
-        return self.step_all([state])[0]
-
-    def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        return checkpoint(self.simulator.next_states, states, use_reentrant=False, preserve_rng_state=False)
 
 
 @dataclass

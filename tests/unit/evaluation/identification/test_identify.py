@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from gpe_pl.evaluation.checkpointed import Checkpointed
 from gpe_pl.evaluation.identification.answer import Answer, pairs_of, read_answers, side_by_side
 from gpe_pl.evaluation.identification.calibration import FewScenesError, Pairs, calibrated
 from gpe_pl.evaluation.identification.gradient_check import GradientCheck, gradient_check
@@ -17,7 +19,7 @@ from gpe_pl.evaluation.identification.observations import ObservationError, Obse
 from gpe_pl.evaluation.identification.results import Task, write_table
 from gpe_pl.evaluation.identification.scene import SolverError, identify, solver_of
 from gpe_pl.evaluation.identification.search import SearchSettings
-from gpe_pl.evaluation.identification.shooting import Checkpointed, Shooting, ShootingError, ShootingSettings, shooting
+from gpe_pl.evaluation.identification.shooting import Shooting, ShootingError, ShootingSettings, shooting
 from gpe_pl.evaluation.identification.unknowns import UnknownError, unknowns_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.conformal import interval_score
@@ -185,6 +187,26 @@ def test_bounds_of_training_do_not_clamp() -> None:
     simulator, seen = learned()
     simulator.get_buffer("trained_sand").copy_(torch.tensor([[30.0], [31.0]]))
     assert gradients_of(simulator, seen).misfit_and_gradient([0.9])[1][0] != 0
+
+
+def test_checkpointed_steps_have_the_gradients_of_plain_ones() -> None:
+    """Also those of walls, which a step leaves as they are."""
+    simulator, seen = learned()
+    start = simulator.initial_state(seen, 5)
+
+    def gradients(advanced: Any) -> list[torch.Tensor]:
+        leaves = [start.material_params.clone().requires_grad_(), start.boundary.pos.clone().requires_grad_()]
+        walls = replace(start.boundary, pos=1 * leaves[1])
+        states: list[Any] = [replace(start, material_params=1 * leaves[0], boundary=walls)]
+        for _ in range(3):
+            states = advanced(states)
+        found = torch.autograd.grad((states[0].pos ** 2).sum(), leaves)
+        assert all(torch.isfinite(g).all() and g.abs().max() > 0 for g in found)
+        return list(found)
+
+    plain = gradients(simulator.next_states)
+    for own, expected in zip(gradients(Checkpointed(simulator).step_all), plain, strict=True):
+        assert torch.allclose(own, expected, rtol=1e-6, atol=1e-12)
 
 
 def test_memory_does_not_grow_with_the_activations_of_a_horizon() -> None:
