@@ -26,7 +26,7 @@ from gpe_pl.trajectory.arrays import estimated_normals, numbers
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.trajectory import Trajectory
 
-Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "calculix", "arrays"]
+Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "calculix", "thermognn", "arrays"]
 
 SPLIT_NAMES = {"train": "train", "valid": "val", "validation": "val", "val": "val", "test": "test", "test_unseen": "test_unseen"}
 """Names of splits in the store, by their names in public data sets."""
