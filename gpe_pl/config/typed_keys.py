@@ -20,6 +20,7 @@ UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "training.warmup_steps": ("training.schedule", lambda schedule: schedule != "cosine"),
     "training.push_steps": ("training.push_fraction", lambda fraction: fraction == 0),
     "training.push_correction": ("training.push_fraction", lambda fraction: fraction == 0),
+    "training.stress_loss": ("model.stress", lambda stress: stress is False),
     "training.stress_weight": ("model.stress", lambda stress: stress is False),
     "model.wall_distance": ("model.elastic", lambda elastic: elastic is False),
     "model.only_contacts": ("model.elastic", lambda elastic: elastic is False),

@@ -1,4 +1,4 @@
-"""Terms of the loss of accelerations: penalties of an error, and weights that depend on a node's number of neighbours.
+"""Terms of the loss: penalties of an error, weights that depend on a node's number of neighbours, and errors of stresses.
 
 Source of ``root`` and of the weights: Ummenhofer et al. 2020, "Lagrangian Fluid Simulation with Continuous Convolutions", ICLR, section 4. Their loss is the
 mean of exp(−n/40) |error|^0.5, where n is the number of neighbours, and 40 is about its mean.
@@ -10,17 +10,21 @@ from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
 Loss = Literal["square", "log", "root"]
+StressLoss = Literal["square", "relative"]
 
 SMALL_ERROR = 0.1
 """Scale s of the penalty ``log``, in units of normalised accelerations. For smaller errors, ``log`` is nearly the square."""
 LEAST_ERROR = 6.3e-4
 """Error of a position [rest spacings] below which the penalty ``root`` is smooth. The code of Ummenhofer et al. adds 1e-9 m² to the square, with a spacing of
 0.05 m."""
+
+LEAST_STRESS = 0.01
+"""Root mean square of the stress in a graph, in the unit of the data set, below which relative errors no longer grow."""
 
 
 def penalty(error: Float[Tensor, "node dim"], loss: Loss, least: Float[Tensor, ""]) -> Float[Tensor, "node _"]:
@@ -36,6 +40,31 @@ def penalty(error: Float[Tensor, "node dim"], loss: Loss, least: Float[Tensor, "
     if loss == "root":
         return (error.square().sum(dim=1, keepdim=True) + least.square()) ** 0.25
     return SMALL_ERROR**2 * (error / SMALL_ERROR).square().log1p() if loss == "log" else error.square()
+
+
+def stress_error(
+    predicted: Float[Tensor, "node component"],
+    target: Float[Tensor, "node component"],
+    loss: StressLoss,
+    graph: Int64[Tensor, " node"],
+) -> Float[Tensor, "node component"]:
+    """Return squared errors of normalised stresses.
+
+    With ``relative``, they are divided by the mean square of the target in the node's graph plus ``LEAST_STRESS``². Their mean is then that of the squared
+    relative L2 norms of the graphs, so that small stresses count as much as large ones.
+
+    Args:
+        predicted, target: stresses in the unit of the data set.
+        loss: kind of the error.
+        graph: number of the graph of each node.
+    """
+    error = (predicted - target).square()
+    if loss == "square":
+        return error
+    square, num_graphs = target.square().mean(dim=1), int(graph.max()) + 1 if len(graph) else 0
+    count = square.new_zeros(num_graphs).index_add_(0, graph, torch.ones_like(square))
+    mean = square.new_zeros(num_graphs).index_add_(0, graph, square) / count.clamp(min=1)
+    return error / (mean[graph] + LEAST_STRESS**2)[:, None]
 
 
 def num_neighbors(data: HeteroData, materials: Sequence[str]) -> dict[str, Float[Tensor, " node"]]:

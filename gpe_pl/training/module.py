@@ -26,7 +26,7 @@ from gpe_pl.models.base import Prediction
 from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.system import ranks
 from gpe_pl.system.machine import has_cpp_compiler
-from gpe_pl.training.loss_terms import LEAST_ERROR, Loss, num_neighbors, penalty
+from gpe_pl.training.loss_terms import LEAST_ERROR, Loss, StressLoss, num_neighbors, penalty, stress_error
 from gpe_pl.training.optimizer import OnePassAdam, clip
 from gpe_pl.training.push_forward import Excursions
 from gpe_pl.training.unroll_gradients import predictions
@@ -75,7 +75,8 @@ class TrainingModule(L.LightningModule):
         schedule: ``exponential`` decays geometrically (paper: 5e-5 to 1e-6); ``cosine`` warms up and follows a half cosine (short budgets); ``staircase`` keeps
             the rate for half of the steps, then falls after every tenth of the steps by the same factor, to the final rate in the last tenth.
         warmup_steps: steps of linear warm-up in the ``cosine`` schedule.
-        loss: penalty of errors of normalised accelerations, ``square``, ``log`` or ``root``; see ``loss_terms.penalty``. Stress always has the squared error.
+        loss: penalty of errors of normalised accelerations, ``square``, ``log`` or ``root``; see ``loss_terms.penalty``.
+        stress_loss: squared errors of the stress, ``square``, or divided by the mean square in each scene, ``relative``; see ``loss_terms.stress_error``.
         stress_weight: weight of the mean squared error of the normalised stress, relative to that of the acceleration; used if the model decodes a stress.
         neighbor_weight: c in the weight exp(−c n/n̄) of the acceleration of a node with n neighbours; see ``loss_terms.num_neighbors``. None weights all alike.
         mean_neighbors: n̄, the mean number of neighbours of a node in the training data.
@@ -92,6 +93,7 @@ class TrainingModule(L.LightningModule):
         schedule: Schedule = "cosine",
         warmup_steps: Annotated[int, Field(ge=0)] = 100,
         loss: Loss = "square",
+        stress_loss: StressLoss = "square",
         stress_weight: Annotated[float, Field(gt=0)] = 1.0,
         neighbor_weight: Annotated[float, Field(gt=0, le=10)] | None = None,
         mean_neighbors: Annotated[float, Field(gt=0)] = 1.0,
@@ -102,6 +104,7 @@ class TrainingModule(L.LightningModule):
         self.num_steps, self.schedule, self.warmup_steps = num_steps, schedule, warmup_steps
         self.learning_rate, self.final_learning_rate = learning_rate, final_learning_rate
         self.loss_kind: Loss = loss
+        self.stress_loss: StressLoss = stress_loss
         self.stress_weight, self.neighbor_weight, self.mean_neighbors = stress_weight, neighbor_weight, mean_neighbors
         self.compile_mode: Compile = compile
         self.val_nmse = OneStepNMSE()
@@ -206,7 +209,7 @@ class TrainingModule(L.LightningModule):
         """Return the loss of the predictions for a batch of training graphs."""
         std = self.simulator.stress_std.to(self.simulator.builder.precision)
         acceleration = [self._penalty(a - self._normalized(batch[m].target)) for m, a in predicted.acceleration.items()]
-        stress = [(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]
+        stress = [self._stress_error(batch, m, s, batch[m].stress_target / std) for m, s in predicted.stress.items()]
         stores = [batch[m] for m in predicted.acceleration]
         if self.neighbor_weight is not None:
             acceleration = self._weighted_by_neighbors(batch, predicted.acceleration, acceleration)
@@ -224,6 +227,12 @@ class TrainingModule(L.LightningModule):
         """Return ``loss_terms.penalty`` of errors [node, dim] of normalised accelerations."""
         unit = self.simulator.builder.scales.acceleration / self.simulator.acceleration_std  # moves a node by one rest spacing in a frame
         return penalty(error, self.loss_kind, (LEAST_ERROR * unit).to(error.dtype))
+
+    def _stress_error(self, batch: HeteroData, material: str, predicted: Tensor, target: Tensor) -> Tensor:
+        """Return ``loss_terms.stress_error`` of the nodes of a material."""
+        store = batch[material]
+        graph = store.batch if "batch" in store else target.new_zeros(len(target), dtype=torch.int64)
+        return stress_error(predicted, target, self.stress_loss, graph)
 
     def _weighted_by_neighbors(self, batch: HeteroData, materials: Iterable[str], errors: list[Tensor]) -> list[Tensor]:
         """Return errors [node, …] of each material, multiplied by the weights of their nodes."""

@@ -30,7 +30,7 @@ from gpe_pl.system.machine import keep_freed_memory
 from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints, Checkpoints
 from gpe_pl.training.interruption import Interruption
-from gpe_pl.training.loss_terms import Loss
+from gpe_pl.training.loss_terms import Loss, StressLoss
 from gpe_pl.training.module import Compile, Schedule, TrainingError, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 
@@ -88,6 +88,7 @@ class TrainingSettings:
     push_steps: Annotated[int, Field(ge=1)] = 20
     push_correction: Annotated[float, Field(ge=0, le=1)] = 1.0
     loss: Loss = "square"
+    stress_loss: StressLoss = "square"
     stress_weight: Annotated[float, Field(gt=0)] = 1.0
     unroll_steps: Annotated[int, Field(ge=1, le=100)] | None = None
     neighbor_weight: Annotated[float, Field(gt=0, le=10)] | None = None
