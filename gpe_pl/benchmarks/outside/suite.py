@@ -14,6 +14,8 @@ import torch
 from pydantic import Field
 
 from gpe_pl.benchmarks.acceptance.trial import Candidate
+from gpe_pl.benchmarks.learning_sets import suite as learning_sets
+from gpe_pl.benchmarks.learning_sets.sets import SETS
 from gpe_pl.benchmarks.outside import engines, experiments
 from gpe_pl.benchmarks.outside.engines import EngineName
 from gpe_pl.benchmarks.outside.experiments import DAM_BREAK_FILE, Experiment, OutsideError
@@ -23,13 +25,10 @@ from gpe_pl.data.ground_truth import DatasetSpec
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PUBLIC = {
-    "data_FluidFall": "DPI-Net's FluidFall, github.com/YunzhuLi/DPI-Net",
-    "data_BoxBath": "DPI-Net's BoxBath, github.com/YunzhuLi/DPI-Net",
-    "data_RiceGrip": "DPI-Net's RiceGrip, github.com/YunzhuLi/DPI-Net",
-    "data_RigidFall": "VGPL's RigidFall, github.com/YunzhuLi/VGPL-Dynamics-Prior",
-}
-"""Public data sets by the names of their folders."""
+LEARNING_SETS = "learning_sets"
+"""Name of the suite of public learning sets."""
+RESUMES = True
+"""``run`` takes the folder of the suite, beside which the suite of public learning sets has its own."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,13 @@ class Settings:
     num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
 
 
-def run(settings: Settings, specs: Mapping[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
+def run(settings: Settings, specs: Mapping[str, DatasetSpec], own: Path) -> tuple[list[dict[str, Any]], str]:
     """Return a record per curve, per quantity of an engine and per missing thing, and a Markdown report.
+
+    Args:
+        settings: settings of the suite.
+        specs: data sets, by name.
+        own: folder of the suite's results. What ``suite=learning_sets`` has measured in the folder beside it is reported, too.
 
     Raises:
         OutsideError: a checkpoint was trained on none of ``specs``, or a file of the user cannot be read.
@@ -68,7 +72,8 @@ def run(settings: Settings, specs: Mapping[str, DatasetSpec]) -> tuple[list[dict
     records += [record for name in present for c in candidates for record in engines.compared(name, c)]
     missing = missing_things(folder, settings)
     records += [{"missing": name, "remedy": remedy} for name, remedy in missing]
-    return records, report(records, missing, folder)
+    measured = learning_sets.records_in(own.parent / LEARNING_SETS)
+    return records + [{"learning_set": record} for record in measured], report(records, missing, folder, measured)
 
 
 def _candidate(checkpoint: str, specs: Mapping[str, DatasetSpec]) -> Candidate:
@@ -89,21 +94,17 @@ def missing_things(folder: Path, settings: Settings) -> list[tuple[str, str]]:
     for name in settings.engines:
         if engines.SCENES[name].is_missing():
             found.append((engines.SCENES[name].label, engines.SCENES[name].remedy))
-    found += [(about, f"put its folder into {folder}") for name, about in PUBLIC.items() if not (folder / name).is_dir()]
-    return found
+    return found + learning_sets.missing_sets(folder)
 
 
-def report(records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, str]], folder: Path) -> str:
-    """Return the tables, and what is there besides and what is missing."""
-    parts = [experiments.report(records), engines.report(records)]
-    commands = [
-        f"`python -m gpe_pl.convert format=dpinet source={folder / name} name={name.lower()} leave_out=0`, then "
-        f"`python -m gpe_pl.fit data=imported data.name={name.lower()} name={name.lower()}`"
-        for name in PUBLIC
-        if (folder / name).is_dir()
-    ]
+def report(
+    records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, str]], folder: Path, measured: Sequence[Mapping[str, Any]]
+) -> str:
+    """Return the tables, what was measured on public learning sets, how to train on those that are there, and what is missing."""
+    parts = [experiments.report(records), engines.report(records), ["Public learning sets:", "", *learning_sets.table(measured)]]
+    commands = [learning_sets.command(name, folder) for name, own in SETS.items() if (folder / own.source).is_dir()]
     if commands:
-        parts.append(["Public data sets that are there; train and evaluate on them with:", "", *(f"- {command}" for command in commands)])
+        parts.append(["Those that are there; train and evaluate on them with:", "", *(f"- `{command}`" for command in commands)])
     if missing:
         parts.append(["Missing, and how to get it:", "", *(f"- {name}: {remedy}" for name, remedy in missing)])
     return "\n\n".join("\n".join(part) for part in parts if part)

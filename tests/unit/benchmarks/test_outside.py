@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gpe_pl.benchmarks.learning_sets.sets import FULL
 from gpe_pl.benchmarks.outside import engines, suite
 from gpe_pl.benchmarks.outside.experiments import DAM_BREAK_FILE, Curve, OutsideError, deviation, drop_radius, measured_fronts, run_out
 
@@ -47,12 +48,14 @@ def test_the_report_names_what_is_missing_and_what_is_there(tmp_path: Path, monk
     (tmp_path / "data_FluidFall").mkdir()
     missing = suite.missing_things(tmp_path, suite.Settings({}, experiments=["dam_break"], engines=["calculix"]))
     names = [name for name, _ in missing]
-    assert names[0].startswith("measured fronts of dam breaks") and "Engine" in names and not any("FluidFall" in name for name in names)
+    assert names[0].startswith("measured fronts of dam breaks") and "Engine" in names and "beam" in names and "fluidfall" not in names
     line = Curve("solver", np.array([1.0, 3.0]), np.array([1.0, 3.0]))
     curves = [Curve("law", np.array([2.0]), np.array([4.0])), line, Curve("model", np.array([1.0, 3.0]), np.array([np.nan, np.nan]))]
     records = [{"experiment": "droplet", "model": "m", "series": c.series, "x": c.x.tolist(), "y": c.y.tolist()} for c in curves]
-    text = suite.report(records, missing, tmp_path)
+    measured = [{"set": "ricegrip", "split": "", "seed": 0, "values": {"model": {FULL: 0.25}, "ballistic": {FULL: 0.5}}}]
+    text = suite.report(records, missing, tmp_path, measured)
     assert "| droplet | m | law | 1 | 50.0 % | not measured |" in text
     assert "- Engine: install it" in text
-    assert f"source={tmp_path / 'data_FluidFall'} name=data_fluidfall leave_out=0" in text
+    assert f"suite=learning_sets suite.folder={tmp_path} 'suite.only=[fluidfall]'`" in text and "suite.only=[beam]" not in text
+    assert "| ricegrip | full rollout, RMS distance [m] |  | 0.5 (ballistic) | 0.25 | 1 of 1 | 0 |" in text
     assert suite.figures(records).keys() == {"droplet_m"}

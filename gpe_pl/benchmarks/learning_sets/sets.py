@@ -1,0 +1,86 @@
+"""Public learning sets: where their files are, how they are split, and what was published of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from gpe_pl.data.importers.source import Format
+
+SetName = Literal["beam", "fluidfall", "boxbath", "rigidfall", "ricegrip"]
+
+POSITION, VELOCITY, STRESS = "position, relative L2", "velocity, relative L2", "stress, relative L2"
+FULL, ONE_STEP = "full rollout, RMS distance [m]", "one step, RMS distance [m]"
+SPACING = "spacing of the settled liquid over the truth's"
+RIGIDITY = "change of distances in a body over its size"
+QUANTITIES = (POSITION, VELOCITY, STRESS, FULL, ONE_STEP, SPACING, RIGIDITY)
+"""Quantities in the order of the table."""
+
+
+@dataclass(frozen=True)
+class LearningSet:
+    """A public learning set.
+
+    Attributes:
+        source: its folder in the user's folder.
+        origin: where to get it.
+        format: format of ``convert``.
+        start: frame of the stored trajectory at which rollouts start.
+        leave_out: trajectories that are the test one after the other, by number; with none, there is one split.
+        splits: numbers of the trajectories of each split; None takes the published split.
+        is_relative: whether errors are relative L2 norms of position, velocity and stress per frame; else RMS distances in m.
+        published: published figures by quantity.
+        note: where these figures are from.
+    """
+
+    source: str
+    origin: str
+    format: Format
+    start: int
+    leave_out: tuple[int, ...] = ()
+    splits: Mapping[str, list[int]] | None = None
+    is_relative: bool = False
+    published: Mapping[str, float] = field(default_factory=dict)
+    note: str = ""
+
+    def parts(self) -> dict[str, dict[str, Any]]:
+        """Return the settings of ``convert`` for each split, by a label."""
+        if self.leave_out:
+            return {f"without {k}": {"leave_out": k} for k in self.leave_out}
+        return {"": {} if self.splits is None else {"splits": dict(self.splits)}}
+
+
+SETS: dict[SetName, LearningSet] = {
+    "beam": LearningSet(
+        "database_beam",
+        "data/database_beam of github.com/quercushernandez/ThermodynamicsGNN",
+        "thermognn",
+        start=1,  # frame 0 is the one that the importer puts before the first
+        is_relative=True,
+        published={POSITION: 4.1e-3, VELOCITY: 1.7e-2, STRESS: 9.5e-2},
+        note="the published weights of ThermodynamicsGNN on the published split",
+    ),
+    "fluidfall": LearningSet(
+        "data_FluidFall",
+        "data/data_FluidFall of github.com/YunzhuLi/DPI-Net",
+        "dpinet",
+        start=5,
+        leave_out=(0, 1, 2, 3, 4),
+        published={FULL: 0.0415, ONE_STEP: 5.6e-4},
+        note="the published weights of DPI-Net on the same rollouts, which were not in their training",
+    ),
+    "boxbath": LearningSet(
+        "data_BoxBath", "data/data_BoxBath of github.com/YunzhuLi/DPI-Net", "dpinet", start=1, leave_out=(0, 1, 2, 3, 4)
+    ),
+    "rigidfall": LearningSet(
+        "data_RigidFall/demo",
+        "data/data_RigidFall of github.com/YunzhuLi/VGPL-Dynamics-Prior",
+        "dpinet",
+        start=3,
+        splits={"val": [7], "test": [8, 9]},
+    ),
+    "ricegrip": LearningSet(
+        "data_RiceGrip", "data/data_RiceGrip of github.com/YunzhuLi/DPI-Net", "dpinet", start=1, splits={"val": [3], "test": [4]}
+    ),
+}

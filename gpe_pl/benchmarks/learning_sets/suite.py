@@ -1,0 +1,167 @@
+"""The suite of public learning sets: imports, trains, and evaluates with the published metric and split, beside published figures and trivial baselines.
+
+Each training is a process of ``python -m gpe_pl.fit``. A command that was stopped goes on where it was. Nothing is fetched from a network.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+
+from gpe_pl.benchmarks.learning_sets.measures import MODEL, measured, pooled, trivial
+from gpe_pl.benchmarks.learning_sets.sets import QUANTITIES, SETS, SetName
+from gpe_pl.data.importers import ImportSettings, import_dataset
+from gpe_pl.data.importers.assemble import FOLDER
+from gpe_pl.errors import GpeError
+from gpe_pl.files.atomic import replace_text
+from gpe_pl.files.markdown import table_row
+
+RESUMES = True
+"""``run`` takes a folder and continues where an earlier run was stopped."""
+
+MEASURED_FILE = "measured.json"
+HEADER = ["data set", "quantity", "published", "trivial baseline", "model", "splits", "seeds"]
+
+
+class TrainingError(GpeError, RuntimeError):
+    """Raised when a training fails; the message names its command."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the suite.
+
+    Attributes:
+        folder: folder with the files of the data sets.
+        only: data sets that are trained and evaluated. What is there of the others is reported.
+        seeds: seeds of the trainings.
+        num_splits: maximum number of splits of a data set that leaves one trajectory out after the other; None for all.
+        training: overrides of ``python -m gpe_pl.fit`` for each data set.
+        num_threads: threads of PyTorch in evaluations.
+    """
+
+    folder: str = "outside"
+    only: list[SetName] = field(default_factory=lambda: list(SETS))
+    seeds: Annotated[list[int], Field(min_length=1)] = field(default_factory=lambda: [0])
+    num_splits: Annotated[int, Field(ge=1)] | None = None
+    training: dict[SetName, list[str]] = field(default_factory=dict)
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
+
+
+def run(settings: Settings, folder: Path) -> tuple[list[dict[str, Any]], str]:
+    """Return a record per training, and a Markdown table.
+
+    Raises:
+        ImportFailure: files of a data set cannot be read.
+        TrainingError: a training failed.
+    """
+    torch.set_num_threads(settings.num_threads)
+    source = Path(settings.folder).expanduser()
+    for name in settings.only:
+        if (source / SETS[name].source).is_dir():
+            for label, splits in list(SETS[name].parts().items())[: settings.num_splits]:
+                for seed in settings.seeds:
+                    _trained(name, label, splits, seed, source, folder, settings.training.get(name, []))
+    records = records_in(folder)
+    return records, report(records, source)
+
+
+def _trained(name: SetName, label: str, splits: Mapping[str, Any], seed: int, source: Path, folder: Path, overrides: Sequence[str]) -> None:
+    """Import, train and measure one split with one seed, as far as it has not been done."""
+    learning_set = SETS[name]
+    dataset = "_".join([name, *label.split()])
+    root = folder / "data" / dataset / FOLDER
+    if not root.is_dir():
+        import_dataset(folder / "data", ImportSettings(learning_set.format, str(source / learning_set.source), name=dataset, **splits))
+    run_name = f"{dataset}_seed_{seed}"
+    about = ["data=imported", f"data.name={dataset}", f"name={run_name}", f"seed={seed}", *overrides]
+    paths = [f"paths.data={folder / 'data'}", f"paths.runs={folder / 'runs'}"]
+    if subprocess.run([sys.executable, "-m", "gpe_pl.fit", *about, *paths], check=False).returncode:
+        raise TrainingError(f"python -m gpe_pl.fit {' '.join(about)}: failed; its messages are above")
+    checkpoint = folder / "runs" / run_name / "checkpoints" / "best.ckpt"
+    digest = sha256(checkpoint.read_bytes()).hexdigest()
+    stored = folder / "runs" / run_name / MEASURED_FILE
+    if not stored.is_file() or json.loads(stored.read_text(encoding="utf-8"))["checkpoint"] != digest:
+        values = measured(checkpoint, root, learning_set)
+        record = {"set": name, "split": label, "seed": seed, "training": list(overrides), "values": values, "checkpoint": digest}
+        replace_text(stored, json.dumps(record) + "\n")
+
+
+def records_in(folder: Path) -> list[dict[str, Any]]:
+    """Return what was measured of every finished training in the folder of the suite."""
+    return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob(f"runs/*/{MEASURED_FILE}"))]
+
+
+def report(records: Sequence[Mapping[str, Any]], source: Path) -> str:
+    """Return the table of what was measured, and what is missing."""
+    parts = ["\n".join(table(records))]
+    if missing := missing_sets(source):
+        parts.append("\n".join(["Missing, and how to get it:", "", *(f"- {name}: {remedy}" for name, remedy in missing)]))
+    return "\n\n".join(parts)
+
+
+def table(records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the lines of the table, and what its columns mean."""
+    rows = [line for name in SETS for line in _rows(name, [record for record in records if record["set"] == name])]
+    noted = [f"- {name}: {SETS[name].note}." for name in SETS if SETS[name].note and any(record["set"] == name for record in records)]
+    return [table_row(HEADER), "|" + "---|" * len(HEADER), *rows, "", NOTE, *(["", "Published figures:", "", *noted] if noted else [])]
+
+
+NOTE = (
+    "Test trajectories are never trained on. RMS distances are pooled over frames, nodes, trajectories and splits. Relative L2 norms are means over frames. "
+    "Over several seeds: mean and range. The trivial baseline is the best one."
+)
+
+
+def _rows(name: SetName, records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the rows of a data set; one that says so if nothing was measured."""
+    if not records:
+        return [table_row([name, "", "", "", "not measured", "", ""])]
+    learning_set, lines = SETS[name], list[str]()
+    seeds = sorted({record["seed"] for record in records})
+    for quantity in QUANTITIES:
+        known = [record for record in records if quantity in record["values"][MODEL]]
+        if not known:
+            continue
+        own = [pooled(quantity, [r["values"][MODEL][quantity] for r in known if r["seed"] == seed]) for seed in seeds]
+        best = trivial(_baselines(known, quantity), quantity)
+        published = learning_set.published.get(quantity)
+        splits = sorted({record["split"] for record in known})
+        cells = [
+            *(
+                name,
+                quantity,
+                "" if published is None else f"{published:.3g}",
+                "" if best is None else f"{best[1]:.3g} ({best[0].replace('_', ' ')})",
+            ),
+            f"{sum(own) / len(own):.3g}" + (f" ({min(own):.3g} – {max(own):.3g})" if len(own) > 1 else ""),
+            f"{len(splits)} of {len(learning_set.parts())}",
+            ", ".join(map(str, seeds)),
+        ]
+        lines.append(table_row(cells))
+    return lines
+
+
+def _baselines(records: Sequence[Mapping[str, Any]], quantity: str) -> dict[str, dict[str, float]]:
+    """Return the pooled values of each baseline."""
+    names = [name for name in records[0]["values"] if name != MODEL and quantity in records[0]["values"][name]]
+    return {name: {quantity: pooled(quantity, [r["values"][name][quantity] for r in records])} for name in names}
+
+
+def missing_sets(source: Path) -> list[tuple[str, str]]:
+    """Return the data sets that are not in the user's folder, each with how to get it."""
+    return [(name, f"put {s.origin} into {source / s.source}") for name, s in SETS.items() if not (source / s.source).is_dir()]
+
+
+def command(name: SetName, source: Path) -> str:
+    """Return the command that trains and evaluates on a data set."""
+    return f"python -m gpe_pl.benchmark suite=learning_sets suite.folder={source} 'suite.only=[{name}]'"

@@ -1,0 +1,128 @@
+"""The suite of public learning sets: metrics, pooling, what is reported and what is done again."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpe_pl.benchmarks.learning_sets import measures, suite
+from gpe_pl.benchmarks.learning_sets.sets import FULL, ONE_STEP, POSITION, RIGIDITY, SETS, SPACING, STRESS, VELOCITY
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.trajectory.store import iter_trajectories
+from gpe_pl.trajectory.trajectory import Trajectory
+from tests import sources
+
+
+def test_a_relative_error_is_the_mean_of_those_of_the_frames() -> None:
+    truth = np.ones((2, 3, 2)) * [[[1.0]], [[10.0]]]
+    assert measures.relative_error(1.1 * truth, truth) == pytest.approx(0.1)
+    assert measures.relative_error(truth + 1.0, truth) == pytest.approx((1.0 + 0.1) / 2)
+
+
+def test_central_velocities_are_those_of_an_accelerated_motion() -> None:
+    time = 0.1 * np.arange(5)[:, None, None]
+    pos = 2.0 * time + 3.0 * time**2 / 2
+    np.testing.assert_allclose(measures.central_velocities(pos, 0.1)[:, 0, 0], (2.0 + 3.0 * time[1:])[:, 0, 0])
+
+
+def test_values_of_trajectories_become_one() -> None:
+    assert measures.pooled(FULL, [3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
+    assert measures.pooled(RIGIDITY, [3.0, 4.0]) == 4.0
+    assert measures.pooled(POSITION, [3.0, 4.0]) == 3.5
+
+
+def test_the_best_baseline_has_the_smallest_error_or_the_ratio_nearest_to_one() -> None:
+    values = {"model": {FULL: 0.1}, "ballistic": {FULL: 3.0, SPACING: 0.5}, "constant_velocity": {FULL: 2.0, SPACING: 1.4}}
+    assert measures.trivial(values, FULL) == ("constant_velocity", 2.0)
+    assert measures.trivial(values, SPACING) == ("constant_velocity", 1.4)
+    assert measures.trivial(values, RIGIDITY) is None
+
+
+def test_splits_leave_one_out_or_are_published() -> None:
+    assert list(SETS["fluidfall"].parts().values()) == [{"leave_out": k} for k in range(5)]
+    assert SETS["beam"].parts() == {"": {}}
+    assert SETS["rigidfall"].parts()[""]["splits"]["test"] == [8, 9]
+
+
+def record(split: str, seed: int, model: float, baseline: float) -> dict[str, Any]:
+    values = {"model": {FULL: model, SPACING: 0.9}, "ballistic": {FULL: baseline}}
+    return {"set": "fluidfall", "split": split, "seed": seed, "values": values}
+
+
+def test_the_table_pools_splits_and_gives_the_range_of_seeds(tmp_path: Path) -> None:
+    records = [
+        record("without 0", 0, 3.0, 5.0),
+        record("without 1", 0, 4.0, 12.0),
+        record("without 0", 1, 1.0, 5.0),
+        record("without 1", 1, 1.0, 12.0),
+    ]
+    text = suite.report(records, tmp_path)
+    assert "| fluidfall | full rollout, RMS distance [m] | 0.0415 | 9.19 (ballistic) | 2.27 (1 – 3.54) | 2 of 5 | 0, 1 |" in text
+    assert "| fluidfall | spacing of the settled liquid over the truth's |  |  | 0.9 (0.9 – 0.9) | 2 of 5 | 0, 1 |" in text
+    assert "| beam |  |  |  | not measured |  |  |" in text
+    assert f"- beam: put data/database_beam of github.com/quercushernandez/ThermodynamicsGNN into {tmp_path / 'database_beam'}" in text
+
+
+@pytest.fixture
+def falls(tmp_path: Path) -> Path:
+    """A folder with rollouts in the layout of FluidFall."""
+    for k in range(4):
+        pos = sources.motion(14, dim=3, seed=k)
+        sources.dpinet(tmp_path / "files" / "data_FluidFall" / "valid" / str(k), pos, np.gradient(pos, 1 / 60, axis=0))
+    return tmp_path / "files"
+
+
+def test_every_split_is_trained_and_measured_once(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = []
+
+    def trained(command: list[str], check: bool) -> SimpleNamespace:
+        values = dict(argument.split("=", 1) for argument in command[3:])
+        commands.append(values)
+        first = next(iter_trajectories(Path(values["paths.data"]) / values["data.name"] / "imported", "train"))
+        builder = GraphBuilder(GraphConfig(history=2), first.metadata)
+        checkpoint = Path(values["paths.runs"]) / values["name"] / "checkpoints" / "best.ckpt"
+        checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=4), builder).save(checkpoint)
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr(subprocess, "run", trained)
+    settings = suite.Settings(str(falls), only=["fluidfall", "beam"], seeds=[3], num_splits=2, training={"fluidfall": ["graph.history=2"]})
+    records, text = suite.run(settings, tmp_path / "runs")
+    assert [(r["set"], r["split"], r["seed"]) for r in records] == [("fluidfall", "without 0", 3), ("fluidfall", "without 1", 3)]
+    assert [c["name"] for c in commands] == ["fluidfall_without_0_seed_3", "fluidfall_without_1_seed_3"]
+    assert all(c["seed"] == "3" and c["graph.history"] == "2" for c in commands)
+    assert records[0]["values"]["model"].keys() == {FULL, ONE_STEP, SPACING}
+    assert records[0]["values"]["constant_velocity"][ONE_STEP] < records[0]["values"]["constant_velocity"][FULL]
+    assert "| 2 of 5 | 3 |" in text and "beam: put" in text
+
+
+def test_a_training_that_fails_names_its_command(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
+    with pytest.raises(suite.TrainingError, match=r"name=fluidfall_without_0_seed_0 seed=0: failed"):
+        suite.run(suite.Settings(str(falls), only=["fluidfall"], num_splits=1), tmp_path / "runs")
+
+
+def moving(num_frames: int = 4, **arrays: Any) -> Trajectory:
+    pos = np.arange(num_frames * 4.0).reshape(num_frames, 2, 2) + 1
+    return Trajectory.from_numpy(pos, 0.1, "elastomer", {"elastomer": 1e5}, **arrays)
+
+
+def test_a_rollout_that_stopped_stays_where_it_was() -> None:
+    whole = moving()
+    _, pos = measures.lasting(whole.frames(0, 2), 4)
+    np.testing.assert_array_equal(pos[1:], np.stack([whole.pos[1]] * 3))
+
+
+def test_relative_quantities_need_a_stress_in_every_frame() -> None:
+    truth = moving(stress=np.ones((4, 2, 4)))
+    found = dict(measures.errors((truth, truth.pos), truth, True))
+    assert found.keys() == {POSITION, VELOCITY, STRESS} and found[POSITION] == found[STRESS] == 0
+    assert dict(measures.errors((truth.frames(0, 2), truth.pos), truth, True)).keys() == {POSITION, VELOCITY}
