@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpe_pl.evaluation import checkpointed
 from gpe_pl.evaluation.checkpointed import Checkpointed
 from gpe_pl.evaluation.identification.answer import Answer, pairs_of, read_answers, side_by_side
 from gpe_pl.evaluation.identification.calibration import FewScenesError, Pairs, calibrated
@@ -189,8 +190,9 @@ def test_bounds_of_training_do_not_clamp() -> None:
     assert gradients_of(simulator, seen).misfit_and_gradient([0.9])[1][0] != 0
 
 
-def test_checkpointed_steps_have_the_gradients_of_plain_ones() -> None:
-    """Also those of walls, which a step leaves as they are."""
+def test_checkpointed_steps_have_the_gradients_of_plain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also those of walls, which a step leaves as they are, and over several segments."""
+    monkeypatch.setattr(checkpointed, "SEGMENT", 2)
     simulator, seen = learned()
     start = simulator.initial_state(seen, 5)
 
@@ -198,7 +200,7 @@ def test_checkpointed_steps_have_the_gradients_of_plain_ones() -> None:
         leaves = [start.material_params.clone().requires_grad_(), start.boundary.pos.clone().requires_grad_()]
         walls = replace(start.boundary, pos=1 * leaves[1])
         states: list[Any] = [replace(start, material_params=1 * leaves[0], boundary=walls)]
-        for _ in range(3):
+        for _ in range(5):
             states = advanced(states)
         found = torch.autograd.grad((states[0].pos ** 2).sum(), leaves)
         assert all(torch.isfinite(g).all() and g.abs().max() > 0 for g in found)
