@@ -102,6 +102,7 @@ class TrajectoryDataModule(L.LightningDataModule):
 
     Raises:
         AugmentationError: the scenes do not have a symmetry of ``augmentation``.
+        OpenScenesError: the scenes are open, and a setting needs nodes that stay.
         StoreError: a split or its statistics are missing or damaged, too many of its trajectories cannot be used, none is long enough for a window, or a node
             may move by half a period within a frame of this stride.
         NoiseError: the noise is too large for the spacing of the data.
@@ -131,8 +132,8 @@ class TrajectoryDataModule(L.LightningDataModule):
         self.push_forward: PushForward | None = None
         std = data_statistics(root)["acceleration_std"]
         stored = open_split(root, "train")
-        train = usable(stored)
-        val = every(usable(open_split(root, "val")), stride)
+        train = usable(stored, stride)
+        val = every(usable(open_split(root, "val"), stride), stride)
         self.metadata = train[0].window(0, 1).metadata
         if stride > 1:
             window_counts(every(train, stride), graph.history)

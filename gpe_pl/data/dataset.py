@@ -20,6 +20,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.noise import Noise
+from gpe_pl.data.open_windows import carried, check_settings, continued
 from gpe_pl.data.solver_targets import SolverTargets
 from gpe_pl.data.statistics import FRAMES_AT_ONCE
 from gpe_pl.data.training_samples import Unroll, UnrollStart, training_graph
@@ -92,6 +93,7 @@ class StoredTrajectory:
         cached: the trajectory with all stored frames if the split is cached in memory and its values are valid, else None.
         stride: number of stored frames in a frame.
         phase: stored frame that is frame 0 of this view.
+        is_open: whether its nodes enter and leave.
     """
 
     path: Path
@@ -101,6 +103,7 @@ class StoredTrajectory:
     cached: Trajectory | None
     stride: int = 1
     phase: int = 0
+    is_open: bool = False
 
     @property
     def num_frames(self) -> int:
@@ -145,13 +148,14 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
     stored = []
     for path in paths:
         with open_shard(path) as file:
-            shapes = {name: open_field(open_group(file, name), "pos").shape[:2] for name in sorted(file)}
-        for name, (num_frames, num_nodes) in shapes.items():
+            groups = {name: open_group(file, name) for name in sorted(file)}
+            shapes = {name: (*open_field(group, "pos").shape[:2], "alive" in group) for name, group in groups.items()}
+        for name, (num_frames, num_nodes, is_open) in shapes.items():
             cached = None
             if fits:
                 with suppress(UnsoundError):  # ``usable`` reports it
                     cached = _read_only(read_trajectory(path, name, verify=True))
-            stored.append(StoredTrajectory(path, name, num_frames, num_nodes, cached))
+            stored.append(StoredTrajectory(path, name, num_frames, num_nodes, cached, is_open=is_open))
     if not stored:
         raise StoreError(f"{paths[0].parent}: its shards hold no trajectories; generate or import the data again")
     return stored
@@ -169,7 +173,7 @@ def long_enough(root: Path | str, split: str, history: int, stride: int = 1) -> 
             except UnsoundError as error:
                 _warn(path, name, error.fault)
                 continue
-            fault = damage(trajectory)
+            fault = damage(trajectory, stride)
             trajectory = trajectory.every(stride)
             if fault is None and trajectory.num_frames < history + 2:
                 fault = f"its {trajectory.num_frames} frames are fewer than the {history + 2} that a start at frame {history} needs"
@@ -183,8 +187,12 @@ def _warn(path: Path, name: str, fault: str) -> None:
     log.warning("%s:%s: left out, %s; see `python -m gpe_pl.data.validate`", path, name, fault)
 
 
-def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
+def usable(trajectories: list[StoredTrajectory], stride: int = 1) -> list[StoredTrajectory]:
     """Return the trajectories that can be learned from, and warn of the others.
+
+    Args:
+        trajectories: trajectories with all stored frames.
+        stride: number of stored frames in a frame of the model.
 
     Raises:
         StoreError: no trajectory can be used, or too many cannot: more than one, and more than the fraction ``MAX_DAMAGED``.
@@ -192,7 +200,7 @@ def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
     found = []
     for stored in trajectories:
         try:
-            fault = damage(stored.whole())
+            fault = damage(stored.whole(), stride)
         except UnsoundError as error:
             fault = error.fault
         if fault is None:
@@ -208,13 +216,18 @@ def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
     return found
 
 
-def damage(trajectory: Trajectory) -> str | None:
-    """Return why nothing can be learned from a trajectory whose values are valid, with frame and node if there is one. None means that it can be used."""
+def damage(trajectory: Trajectory, stride: int = 1) -> str | None:
+    """Return why nothing can be learned from a trajectory whose values are valid, with frame and node if there is one. None means that it can be used.
+
+    Args:
+        trajectory: trajectory with all stored frames.
+        stride: number of stored frames in a frame of the model.
+    """
     pos, metadata = trajectory.pos, trajectory.metadata
     if trajectory.num_nodes == 0:
         return "it has no nodes"
-    if trajectory.alive is not None:
-        return "its nodes enter and leave, and models learn from scenes whose nodes stay"
+    if trajectory.alive is not None and (fault := _open_fault(trajectory, trajectory.alive, stride)) is not None:
+        return fault
     bounds = np.array(metadata.bounds)
     width = np.ptp(bounds, axis=1)
     low, high = (
@@ -225,6 +238,18 @@ def damage(trajectory: Trajectory) -> str | None:
         frame, node = np.argwhere(~near)[0, :2]
         return f"the position of node {node} in frame {frame} lies outside the domain by more than its width"
     return _jump(trajectory)
+
+
+def _open_fault(trajectory: Trajectory, alive: np.ndarray, stride: int) -> str | None:
+    """Return why nothing can be learned from an open scene; None if it can be used."""
+    if not alive.any(axis=1).all():
+        return f"no node is in the scene in frame {int(alive.any(axis=1).argmin())}"
+    if trajectory.stress is not None:
+        return "its nodes enter and leave, and some have a stress"
+    inlets = sum(opening.enters for opening in trajectory.openings)
+    if stride > 1 and inlets > 1:
+        return f"its {inlets} inlets give nodes other numbers with data.stride={stride}"
+    return None
 
 
 def _jump(trajectory: Trajectory) -> str | None:
@@ -307,9 +332,11 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
     Attributes:
         probability: probability of drawing each window [window], or None if all are equal. With it, graphs have a ``weight``: the uniform probability
             divided by this one.
+        is_open: whether nodes enter and leave in any trajectory. Graphs then have a mask ``without_target`` [node] of nodes from which nothing is learned.
 
     Raises:
         AugmentationError: the scenes do not have a symmetry of ``augmentation``.
+        OpenScenesError: the scenes are open, and a setting needs nodes that stay.
         StoreError: no trajectory is long enough. Reading a window raises it if the trajectory cannot be read, or has invalid values.
     """
 
@@ -328,6 +355,9 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         self.trajectories, self.builder, self.noise, self.stress, self.solver = trajectories, builder, noise, stress, solver
         self.augmentation, self.unroll_steps = augmentation, unroll_steps
         augmentation.check(builder.metadata)
+        self.is_open = any(trajectory.is_open for trajectory in trajectories)
+        if self.is_open:
+            check_settings(unroll_steps, solver is not None, augmentation != Augmentation())
         self.velocity_unit, self.seed = velocity_unit, seed
         self.probability: np.ndarray | None = None
         self.ends = np.cumsum(window_counts(trajectories, builder.config.history, unroll_steps))
@@ -354,8 +384,14 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             metadata = trajectory.metadata
             velocities = integrators.velocities(trajectory.pos.astype(np.float64), metadata.frame_dt, metadata.periodicity)
             acc = integrators.acceleration(velocities[1:], velocities[:-1], metadata.frame_dt) - np.asarray(metadata.gravity)
-            acc = acc[:, trajectory.is_predicted]
-            values.append(np.sqrt(np.mean(acc**2, axis=(1, 2)))[self.builder.config.history - 1 :])
+            stays = (
+                np.ones(acc.shape[:2], bool)
+                if trajectory.alive is None
+                else np.all([trajectory.alive[k:][: len(acc)] for k in range(3)], axis=0)
+            )
+            counted = (stays & trajectory.is_predicted)[..., None]
+            square = np.where(counted, acc**2, 0.0).sum(axis=(1, 2)) / np.maximum(1, metadata.dim * counted.sum(axis=(1, 2)))
+            values.append(np.sqrt(square)[self.builder.config.history - 1 :])
         return np.concatenate(values)
 
     @overload
@@ -383,13 +419,13 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         reflection = self.augmentation.reflection(original.metadata, self.seed, sample)
         trajectory = self.augmentation.moved(reflection.trajectory(original), history, self.seed, sample)
         dt = trajectory.metadata.frame_dt
-        truth = trajectory.pos.astype(np.float64)
-        pos = truth[: history + 2]
+        truth = continued(trajectory)
+        pos, is_given = truth[: history + 2], ~trajectory.is_predicted | carried(trajectory.openings, truth[history])
         if self.noise is not None:
             rng = np.random.default_rng((self.seed, sample))
             pos = self.noise.apply(pos, self.builder.metadata.longest_side, self.velocity_unit, dt, rng)
-            if trajectory.prescribed is not None:  # their motion is given exactly
-                pos = np.where(trajectory.prescribed[:, None], truth[: history + 2], pos)
+            if is_given.any():  # their motion is given exactly
+                pos = np.where(is_given[:, None], truth[: history + 2], pos)
         velocities = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
         gravity = np.asarray(trajectory.metadata.gravity)
         past = np.ascontiguousarray(velocities[:-1].swapaxes(0, 1))
@@ -413,7 +449,12 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             frame_velocity=at_frame,
             rigid_body=trajectory.rigid_body,
             loads=trajectory.loads_at(history),
-        ).to_torch()
+        )
+        rows, alive = slice(None), None
+        if self.is_open:
+            alive = np.ones(truth.shape[:2], bool) if trajectory.alive is None else trajectory.alive
+            state, rows = _living(state, trajectory, history)
+        state = state.to_torch()
         stress = None
         if self.stress and trajectory.stress is not None:
             stress = torch.from_numpy(np.array(trajectory.stress.node[history + 1 :], dtype=np.float32))
@@ -426,17 +467,37 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             correction = 0.0 if self.noise is None else self.noise.correction
             key = start or StartKey(sample, window, 0)
             unroll = UnrollStart(
-                state, torch.from_numpy(truth[history:]), stress, correction, key.correction, about, sample, key.lane, targets
+                state,
+                torch.from_numpy(truth[history:]),
+                stress,
+                correction,
+                key.correction,
+                about,
+                sample,
+                key.lane,
+                targets,
+                None if alive is None else torch.from_numpy(alive[history:].copy()),
             )
             return unroll if start else unroll.graph(self.builder, state, 0)
-        target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
-        graph = training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[0], about)
+        target = (integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity)[rows]
+        unknown = (
+            None if alive is None else torch.from_numpy(~alive[history + 1][rows] | carried(trajectory.openings, truth[history][rows]))
+        )
+        graph = training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[0], about, unknown)
         if not is_unroll:
             return graph
         kept = 0.0 if self.noise is None else 1 - self.noise.correction  # fraction of the noise on the position that a step keeps
         left = kept ** np.arange(1, self.unroll_steps + 1)[:, None, None]
         reference = truth[history + 1 :] + left * (pos[history] - truth[history])
         return Unroll(graph, state, torch.from_numpy(reference), stress, about)
+
+
+def _living(state: State, window: Trajectory, frame: int) -> tuple[State, np.ndarray]:
+    """Return the nodes of a state that are in the scene at a frame of a window, with their columns as identities, and these columns [node]."""
+    if window.alive is None:
+        return state, np.arange(state.num_nodes)
+    nodes, known = np.flatnonzero(window.alive[frame]), np.flatnonzero(window.alive[: frame + 1].any(axis=0))
+    return replace(state.take(nodes), openings=window.openings, node_id=nodes, next_id=int(known[-1]) + 1), nodes
 
 
 class CachedGraphs(Dataset[HeteroData]):

@@ -48,9 +48,9 @@ def acceleration_std(trajectories: Iterable[Trajectory]) -> float:
 
 
 def motion(trajectory: Trajectory) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield velocities [m/s] and accelerations without gravity [m/s²] by name, each [frame, node, dim], for a part of the frames at a time.
+    """Yield velocities [m/s] and accelerations without gravity [m/s²] by name, each [..., dim], for a part of the frames at a time.
 
-    Nodes whose motion is given are left out.
+    Nodes whose motion is given are left out, and nodes of open scenes while they are not in the scene.
     """
     dt = trajectory.metadata.frame_dt
     for start in range(0, max(1, trajectory.num_frames - 2), FRAMES_AT_ONCE):
@@ -58,8 +58,16 @@ def motion(trajectory: Trajectory) -> Iterator[tuple[str, np.ndarray]]:
         vel = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
         if trajectory.prescribed is not None:
             vel = vel[:, trajectory.is_predicted]
-        yield "velocity", vel[1:] if start else vel
-        yield "acceleration", integrators.acceleration(vel[1:], vel[:-1], dt) - np.asarray(trajectory.metadata.gravity)
+        acc = integrators.acceleration(vel[1:], vel[:-1], dt) - np.asarray(trajectory.metadata.gravity)
+        first = 1 if start else 0
+        if trajectory.alive is None:
+            yield "velocity", vel[first:]
+            yield "acceleration", acc
+            continue
+        alive = trajectory.alive[start : start + FRAMES_AT_ONCE + 2][:, trajectory.is_predicted]
+        stays = alive[1:] & alive[:-1]
+        yield "velocity", vel[first:][stays[first:]]
+        yield "acceleration", acc[stays[1:] & stays[:-1]]
 
 
 def _scaled(trajectory: Trajectory) -> np.ndarray:

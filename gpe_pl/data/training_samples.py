@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
+from gpe_pl.data.open_windows import carried
 from gpe_pl.data.solver_targets import SolverTargets
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.topology import Topology
@@ -32,6 +33,8 @@ class UnrollStart:
         about: attributes of the graphs: numbers of trajectory and frame, and the weight in the loss if there is one.
         sample, lane: as in ``StartKey``.
         solver_targets: computes targets with the solver instead of with the two corrections; None without a solver.
+        alive: nodes of ``truth`` that are in the scene in each frame [num_steps + 2, node], if the data set has open scenes. The identity of a node is then
+            its column in ``truth``, and its positions before and after are those of ``open_windows.continued``.
     """
 
     state: State
@@ -43,6 +46,7 @@ class UnrollStart:
     sample: int
     lane: int
     solver_targets: SolverTargets | None = None
+    alive: Tensor | None = None
 
     @property
     def num_steps(self) -> int:
@@ -73,18 +77,39 @@ class UnrollStart:
         if self.solver_targets is not None and (found := self.solver_targets.target(state, step)) is not None:
             acceleration, stress = found
             return acceleration, None if self.stress is None else stress
-        where = state.periodicity
-        vel = integrators.velocities(self.truth[step : step + 2], dt, where)[0]
+        where, truth = state.periodicity, self.truth[max(0, step - 1) : step + 2]
+        if state.node_id is not None:
+            truth = truth[:, self._columns(state)]
+        vel = integrators.velocities(truth[-2:], dt, where)[0]
         if step:  # the velocity noise of the start is removed entirely
-            before = integrators.velocities(self.truth[step - 1 : step + 1], dt, where)[0]
+            before = integrators.velocities(truth[:2], dt, where)[0]
             vel = vel + (1 - self.velocity_correction) * (state.vel - before)
-        deviation = integrators.velocities(torch.stack([self.truth[step], state.pos]), dt, where)[0]
+        deviation = integrators.velocities(torch.stack([truth[-2], state.pos]), dt, where)[0]
         acceleration = integrators.acceleration(vel - self.position_correction * deviation, state.vel, dt) - state.gravity
         return acceleration, None if self.stress is None else self.stress[step]
 
+    def without_target(self, state: State, step: int) -> Tensor | None:
+        """Return a mask [node] of the nodes from which nothing is learned after ``step`` steps; None in data sets without open scenes.
+
+        These are nodes that an opening moves, and nodes that are not in the true scene now and one frame later.
+        """
+        if self.alive is None:
+            return None
+        if state.node_id is None:
+            return torch.zeros(state.num_nodes, dtype=torch.bool)
+        columns = self._columns(state)
+        stays = self.alive[step, columns] & self.alive[step + 1, columns] & (columns == state.node_id)
+        return ~stays | torch.from_numpy(carried(state.openings, state.pos.numpy()))
+
+    def _columns(self, state: State) -> Tensor:
+        """Return the column of ``truth`` for each node of an open scene; the last one for nodes that the truth lacks."""
+        columns: Tensor = state.node_id.clamp(max=self.truth.shape[1] - 1)  # type: ignore[union-attr]
+        return columns
+
     def graph(self, builder: GraphBuilder, state: State, step: int) -> HeteroData:
         """Create the training graph of the state that the model has reached after ``step`` steps."""
-        return training_graph(builder, state, *self.target(state, step, builder.metadata.frame_dt), self.about)
+        target, stress = self.target(state, step, builder.metadata.frame_dt)
+        return training_graph(builder, state, target, stress, self.about, self.without_target(state, step))
 
 
 def _arrays(part: Any) -> dict[str, Any]:
@@ -135,7 +160,14 @@ class Unroll:
         return training_graph(builder, state, target, None if self.stress is None else self.stress[step], self.about)
 
 
-def training_graph(builder: GraphBuilder, state: State, target: Tensor, stress: Tensor | None, about: dict[str, Any]) -> HeteroData:
+def training_graph(
+    builder: GraphBuilder,
+    state: State,
+    target: Tensor,
+    stress: Tensor | None,
+    about: dict[str, Any],
+    without_target: Tensor | None = None,
+) -> HeteroData:
     """Create the graph of a state, with targets for each node in the stores of materials.
 
     Args:
@@ -144,9 +176,13 @@ def training_graph(builder: GraphBuilder, state: State, target: Tensor, stress: 
         target: acceleration without gravity [node, dim] in m/s²; stored as ``target``.
         stress: Cauchy stress after the step [node, component] in Pa; stored as ``stress_target``. None stores none.
         about: further attributes of the graph.
+        without_target: nodes from which nothing is learned [node]; stored as ``without_target``. None stores none.
     """
     data = builder(state)
-    _add_targets(data, builder, [{m: data[m].node_id for m in builder.spec.materials}], [target], None if stress is None else [stress])
+    rows = [{m: data[m].node_id for m in builder.spec.materials}]
+    _add_targets(data, builder, rows, [target], None if stress is None else [stress])
+    if without_target is not None:
+        _add_masks(data, builder, rows, [without_target])
     for name, value in about.items():
         data[name] = value
     return data
@@ -167,7 +203,11 @@ def training_batch(
     data, dt = builder.batch(topologies, states), builder.metadata.frame_dt
     targets = [start.target(state, step, dt) for start, state, step in zip(starts, states, steps, strict=True)]
     stresses = [stress for _, stress in targets if stress is not None]
-    _add_targets(data, builder, [t.rows for t in topologies], [target for target, _ in targets], stresses or None)
+    rows = [t.rows for t in topologies]
+    _add_targets(data, builder, rows, [target for target, _ in targets], stresses or None)
+    masks = [start.without_target(state, step) for start, state, step in zip(starts, states, steps, strict=True)]
+    if known := [mask for mask in masks if mask is not None]:
+        _add_masks(data, builder, rows, known)
     for name in starts[0].about:
         data[name] = torch.tensor([start.about[name] for start in starts])
     return data
@@ -181,3 +221,9 @@ def _add_targets(
         for material in materials if values is not None else ():
             parts = [value.to(builder.precision)[own[material]] for value, own in zip(values or (), rows, strict=True)]
             data[material][name] = parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _add_masks(data: HeteroData, builder: GraphBuilder, rows: Sequence[dict[str, Tensor]], masks: Sequence[Tensor]) -> None:
+    """Add masks of nodes without target to the graph of several states; arguments as in ``_add_targets``."""
+    for material in builder.spec.materials:
+        data[material].without_target = torch.cat([mask[own[material]] for mask, own in zip(masks, rows, strict=True)])

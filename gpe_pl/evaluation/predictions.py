@@ -218,15 +218,18 @@ def _cost_of_skipping(prediction: Trajectory, exact: Trajectory, totals: dict[st
 
 
 def _particle_steps(prediction: Trajectory) -> int:
+    if prediction.alive is not None:
+        return max(1, int(prediction.alive[1:].sum()))
     return prediction.num_nodes * max(1, prediction.num_frames - 1)
 
 
 def _edges_per_node(simulator: LearnedSimulator, trajectory: Trajectory) -> float:
     """Return the number of edges within the radius over that of dynamic nodes, in the graph of the middle frame of a trajectory."""
     history = simulator.builder.config.history
-    graph = simulator.builder(trajectory.state(max(history, trajectory.num_frames // 2), history).to_torch())
+    state = trajectory.state(max(history, trajectory.num_frames // 2), history)
+    graph = simulator.builder(state.to_torch())
     edges = (graph[relation].edge_index.shape[1] for relation in simulator.builder.spec.relations if relation[1] == RADIUS)
-    return sum(edges) / trajectory.num_nodes
+    return sum(edges) / state.num_nodes
 
 
 def _fraction_outside(prediction: Trajectory, first: int, last: int, tolerance: float) -> float:

@@ -155,7 +155,7 @@ def one_step_nmse(
     Raises:
         SceneError: every ``stride``-th frame of the data does not fit the simulator.
     """
-    views = every(usable(open_split(root, split)), stride)
+    views = every(usable(open_split(root, split), stride), stride)
     members = members_of(simulator)
     members[0].check_scene(views[0].window(0, 1).metadata)
     datasets = [WindowDataset(views, member.builder) for member in members]

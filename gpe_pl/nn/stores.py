@@ -22,5 +22,11 @@ def contents(data: HeteroData) -> tuple[dict[str, dict[str, Tensor]], dict[EdgeT
 
 
 def predicted_rows(store: Mapping[str, Any], values: Tensor) -> Tensor:
-    """Return the values [node, …] of those nodes of a store that a model has to predict: nodes whose motion is given are left out."""
-    return values[~store["prescribed"]] if "prescribed" in store else values
+    """Return the values [node, …] of those nodes of a store that a model has to predict.
+
+    Nodes whose motion is given are left out, and those of open scenes that have no target.
+    """
+    masks = [store[name] for name in ("prescribed", "without_target") if name in store]
+    if not masks:
+        return values
+    return values[~(masks[0] if len(masks) == 1 else masks[0] | masks[1])]

@@ -34,39 +34,46 @@ def through_openings(before: State, after: State) -> State:
     """
     new, rows = _prescribed(before, after)
     pos = as_numpy(new.pos)
-    leaves = np.any([opening.removes(pos) for opening in after.openings], axis=0)
+    leaves = np.any([opening.removes(pos, before.time, after.time) for opening in after.openings], axis=0)
     known: dict[str, Any] = {name: getattr(after, name) for name in ("num_substeps", "num_corrected", "num_asleep", "lost_impulse")}
     if leaves.any():
         new, rows = replace(new.take(np.flatnonzero(~leaves)), **known), rows[~leaves]
     for opening in after.openings:
         if len(own := opening.entering(before.time, after.time)):
-            new = replace(State.joined([new, _entered(new, opening, own)]), next_id=new.next_id + len(own), **known)
+            entered = _entered(new, opening, own, before.time, after.time)
+            new = replace(State.joined([new, entered]), next_id=new.next_id + len(own), **known)
             rows = np.append(rows, np.full(len(own), -1))
     return replace(new, internal=after.internal.of_rows(rows)) if isinstance(after.internal, FollowsNodes) else new
 
 
 def _prescribed(before: State, after: State) -> tuple[State, np.ndarray]:
-    """Return the state in which nodes of openings with a speed have moved with it, and the row of each node [node], −1 for these nodes."""
+    """Return the state in which nodes of openings with a speed have moved with it, and the row of each node [node], −1 for these nodes.
+
+    Their velocity is the mean one over the frame if the state has a velocity history, else that at the frame.
+    """
     start, pos, vel = as_numpy(before.pos), np.array(as_numpy(after.pos)), np.array(as_numpy(after.vel))
-    moved = np.zeros(len(start), bool)
+    moved, at_frame = np.zeros(len(start), bool), None if after.frame_velocity is None else np.array(as_numpy(after.frame_velocity))
     for opening in after.openings:
-        if opening.speed is not None:
-            inside = opening.contains(start)
-            pos[inside], vel[inside] = start[inside] + (after.time - before.time) * opening.velocity, opening.velocity
+        if opening.drives:
+            inside, mean, now = opening.contains(start), opening.mean_velocity(before.time, after.time), opening.velocity_at(after.time)
+            pos[inside], vel[inside] = start[inside] + (after.time - before.time) * mean, now if after.velocity_history is None else mean
             moved |= inside
+            if at_frame is not None:
+                at_frame[inside] = now
     rows = np.where(moved, -1, np.arange(len(moved)))
     if not moved.any():
         return after, rows
     new = after.corrected(_like(after.pos, pos), _like(after.vel, vel))
-    if new.frame_velocity is None:
-        return new, rows
-    at_frame = np.where(moved[:, None], vel, as_numpy(after.frame_velocity))
-    return replace(new, frame_velocity=_like(after.vel, at_frame)), rows
+    return new if at_frame is None else replace(new, frame_velocity=_like(after.vel, at_frame)), rows
 
 
-def _entered(state: State, opening: Opening, pos: np.ndarray) -> State:
-    """Return new nodes of an opening at ``pos`` [node, dim] as a state with the fields of another one."""
-    count, velocity = len(pos), np.tile(opening.velocity, (len(pos), 1))
+def _entered(state: State, opening: Opening, pos: np.ndarray, start: float, end: float) -> State:
+    """Return new nodes of an opening at ``pos`` [node, dim] as a state with the fields of another one. They entered between two times [s].
+
+    Their velocity is that of other nodes of the opening (see ``_prescribed``), and they had it all the time before.
+    """
+    count, at_end = len(pos), np.tile(opening.velocity_at(end), (len(pos), 1))
+    velocity = at_end if state.velocity_history is None else np.tile(opening.mean_velocity(start, end), (count, 1))
     params = [np.nan if value is None else value for value in opening.params]
     values: dict[str, Any] = {
         "pos": pos,
@@ -79,7 +86,7 @@ def _entered(state: State, opening: Opening, pos: np.ndarray) -> State:
     if state.velocity_history is not None:
         values["velocity_history"] = np.repeat(velocity[:, None], state.velocity_history.shape[1], axis=1)
     if state.frame_velocity is not None:
-        values["frame_velocity"] = velocity
+        values["frame_velocity"] = at_end
     if state.rest_pos is not None:
         values["rest_pos"] = pos
     if state.rigid_body is not None:

@@ -281,7 +281,7 @@ class _Recording:
         known = self.ids[-1] if self.ids else ids[:0]
         new = np.flatnonzero(~np.isin(ids, known))
         if len(new) or not self.entered:
-            self.entered.append(state.take(new))
+            self.entered.append(replace(state.take(new), frame_velocity=None))  # not every state has one, and none is needed
         self.ids.append(ids)
 
     def _velocities(self) -> list[np.ndarray]:

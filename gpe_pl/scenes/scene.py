@@ -191,41 +191,41 @@ class Scene:
         side: str,
         at: Point,
         size: Point,
-        speed: float | int | None = None,
-        flow_rate: float | int | None = None,
+        speed: Any = None,
+        flow_rate: Any = None,
         **properties: Any,
     ) -> Scene:
-        """Add a box that is full of material which enters the scene at a constant speed.
+        """Add a box that is full of material which enters the scene.
 
         Args:
             material: a name of ``schema.MATERIALS`` without mesh.
             side: side of the box where the material comes from, such as ``x_low``.
             at, size: low corner and sides of the box [dim] in m. Along the axis of ``side`` it is at least as deep as nodes see each other.
-            speed: speed into the scene [m/s].
-            flow_rate: instead of the speed, volume that enters in a time [m³/s], or area in 2D [m²/s].
+            speed: speed into the scene [m/s]; or pairs of a time [s] and the speed then, linear in between. While it is negative, the box takes material out.
+            flow_rate: instead of the speed, volume that enters in a time [m³/s], or area in 2D [m²/s]; a number or pairs, too.
             properties: density and material parameters as in ``block``.
         """
         name = f"inlet {len(self.zones) + 1} ({material})"
         if material not in MATERIALS:
             raise SceneFault({name: f"unknown material{did_you_mean(str(material), MATERIALS)}; known are {', '.join(MATERIALS)}"})
-        zone = self._zone(name, side, at, size, speed, flow_rate)
+        zone = self._zone(name, side, at, size, speed, flow_rate, is_inlet=True)
         if zone.speed is None:
             raise SceneFault({name: f"speed, flow_rate: missing; {AT_ONCE}"})
-        velocity = Opening(tuple(zone.low), tuple(zone.high), side, zone.speed).velocity
+        velocity = zone.opening.velocity_at(0.0)
         contains, outline = region.block(zone.low, zone.high)
         if "velocity" in properties:
             raise SceneFault({name: "velocity: follows from speed and side; leave it out"})
         filled = self._with(name, material, zone.low, zone.high, contains, outline, {**properties, "velocity": velocity})
         return replace(self, zones=(*self.zones, replace(zone, body=filled.bodies[-1])))
 
-    def outlet(self, side: str, at: Point, size: Point, speed: float | int | None = None, flow_rate: float | int | None = None) -> Scene:
+    def outlet(self, side: str, at: Point, size: Point, speed: Any = None, flow_rate: Any = None) -> Scene:
         """Add a box where material leaves the scene.
 
         Without speed and flow rate, material disappears as soon as it is in the box, so it flows out freely. Otherwise material in the box moves towards
-        ``side`` with the speed, and disappears there. Other arguments as in ``inlet``.
+        ``side`` with the speed, and disappears there. Speeds and rates are positive. Other arguments as in ``inlet``.
         """
-        zone = self._zone(f"outlet {len(self.zones) + 1}", side, at, size, speed, flow_rate)
-        return replace(self, zones=(*self.zones, zone if zone.speed is None else replace(zone, speed=-zone.speed)))
+        zone = self._zone(f"outlet {len(self.zones) + 1}", side, at, size, speed, flow_rate, is_inlet=False)
+        return replace(self, zones=(*self.zones, zone))
 
     # --- rollouts --------------------------------------------------------------------------------------------------------------------------
 
@@ -367,17 +367,14 @@ class Scene:
         """Bodies, and what is in inlets at the start."""
         return (*self.bodies, *(zone.body for zone in self.zones if zone.body is not None))
 
-    def _zone(self, name: str, side: str, at: Point, size: Point, speed: Any, flow_rate: Any) -> Zone:
+    def _zone(self, name: str, side: str, at: Point, size: Point, speed: Any, flow_rate: Any, is_inlet: bool) -> Zone:
         sides = [f"{axis}_{end}" for axis in "xyz"[: self.dim] for end in ("low", "high")]
         if side not in sides:
             raise SceneFault({name: f"side={side!r}: must be one of {', '.join(sides)}"})
         low, lengths = self._vector(name, "at", at), self._vector(name, "size", size)
         self._positive(name, "size", *lengths.tolist())
-        for key, value in (("speed", speed), ("flow_rate", flow_rate)):
-            if value is not None:
-                self._positive(name, key, value)
         try:
-            return Zone(name, low, low + lengths, side, speed_of(low, low + lengths, side, speed, flow_rate))
+            return Zone(name, low, low + lengths, side, speed_of(low, low + lengths, side, speed, flow_rate, is_inlet))
         except BodyFault as fault:
             raise SceneFault({name: str(fault)}) from None
 

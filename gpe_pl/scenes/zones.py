@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from gpe_pl.scenes.bodies import Body, BodyFault, Nodes
 from gpe_pl.schema import MESH_MATERIALS, node_code
-from gpe_pl.trajectory.openings import Opening
+from gpe_pl.trajectory.openings import Opening, speeds_fault
 
 AT_ONCE = "give speed in m/s or flow_rate in m³/s (m²/s in 2D)"
+Table = tuple[tuple[float, float], ...]
+"""Pairs of a time [s] and a value, linear in between."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +26,7 @@ class Zone:
         name: name in messages, such as ``inlet 1 (fluid)``.
         low, high: corners of its box [dim] in m.
         side: side of the box that is the outer face, such as ``x_low``.
-        speed: speed into the scene [m/s], negative out of it; None for an outlet that removes what reaches it.
+        speed: speed into the scene [m/s], negative out of it, or a table of times and speeds; None for an outlet that removes what reaches it.
         body: material, velocity and parameters of what enters; None for outlets.
     """
 
@@ -30,21 +34,59 @@ class Zone:
     low: np.ndarray
     high: np.ndarray
     side: str
-    speed: float | None
+    speed: float | Table | None
     body: Body | None = None
 
+    @property
+    def opening(self) -> Opening:
+        """The zone as an opening through which nothing enters."""
+        table = self.speed if isinstance(self.speed, tuple) else ()
+        steady = None if isinstance(self.speed, tuple) else self.speed
+        return Opening(tuple(self.low.tolist()), tuple(self.high.tolist()), self.side, steady, speeds=table)
 
-def speed_of(low: np.ndarray, high: np.ndarray, side: str, speed: float | None, flow_rate: float | None) -> float | None:
-    """Return the speed [m/s] of a zone that is given by its speed, by its flow rate [m^dim/s], or by neither.
+
+def speed_of(low: np.ndarray, high: np.ndarray, side: str, speed: Any, flow_rate: Any, is_inlet: bool) -> float | Table | None:
+    """Return the speed of a zone into the scene [m/s], or a table of times and speeds, that is given by speed, flow rate [m^dim/s], or neither.
+
+    Speeds of outlets are given as speeds out of the scene. Tables of inlets may have negative speeds, with which the zone takes material out.
 
     Raises:
-        BodyFault: both are given.
+        BodyFault: both are given, or a value is impossible.
     """
     if speed is not None and flow_rate is not None:
         raise BodyFault(f"speed, flow_rate: {AT_ONCE}, not both")
-    if flow_rate is None:
-        return speed
-    return flow_rate / float(np.prod(np.delete(high - low, "xyz".index(side[0]))))
+    if speed is None and flow_rate is None:
+        return None
+    key, given, area = "speed", speed, 1.0
+    if flow_rate is not None:
+        key, given, area = "flow_rate", flow_rate, float(np.prod(np.delete(high - low, "xyz".index(side[0]))))
+    unit = (1.0 if is_inlet else -1.0) / area
+    if _is_number(given):
+        if not 0 < given < math.inf:
+            raise BodyFault(f"{key}={given!r}: must be a positive number")
+        return unit * float(given)
+    table = _table(key, given)
+    if not is_inlet and min(value for _, value in table) < 0:
+        raise BodyFault(
+            f"{key}: has a negative value; an inlet takes material out while its {key} is negative, and needs its material for the rest"
+        )
+    if max(value for _, value in table) <= 0:
+        raise BodyFault(f"{key}: has no positive value, so nothing would pass")
+    return tuple((time, unit * value) for time, value in table)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _table(key: str, given: Any) -> Table:
+    pairs = list(given) if isinstance(given, (list, tuple)) else []
+    if not pairs or not all(isinstance(pair, (list, tuple)) and len(pair) == 2 and all(map(_is_number, pair)) for pair in pairs):
+        raise BodyFault(f"{key}={given!r}: must be a positive number, or pairs of a time [s] and a value, such as [[0, 0.5], [1, 1.5]]")
+    table = tuple((float(time), float(value)) for time, value in pairs)
+    if (wrong := speeds_fault(table)) is not None:
+        raise BodyFault(f"{key}: {wrong}")
+    return table
 
 
 def opening_of(zone: Zone, spacing: float, radius: float, mass: float, params: Sequence[float]) -> Opening:
@@ -59,8 +101,7 @@ def opening_of(zone: Zone, spacing: float, radius: float, mass: float, params: S
     Raises:
         BodyFault: the zone is too small, or its material has a mesh.
     """
-    low, high = tuple(zone.low.tolist()), tuple(zone.high.tolist())
-    opening = Opening(low, high, zone.side, zone.speed)
+    opening = zone.opening
     if opening.depth < radius * (1 - 1e-6):
         raise BodyFault(f"is {opening.depth:g} m deep along {zone.side[0]}; make it at least as deep as nodes see each other, {radius:g} m")
     if zone.body is None:
@@ -71,7 +112,7 @@ def opening_of(zone: Zone, spacing: float, radius: float, mass: float, params: S
     if narrow < spacing * (1 - 1e-6):
         raise BodyFault(f"is {narrow:g} m wide, less than the distance of nodes, {spacing:g} m")
     known = tuple(None if np.isnan(value) else float(value) for value in params)
-    return Opening(low, high, zone.side, zone.speed, spacing, node_code(zone.body.material), mass, known)
+    return replace(opening, spacing=spacing, node_type=node_code(zone.body.material), mass=mass, params=known)
 
 
 def nodes_of(opening: Opening) -> Nodes:

@@ -13,9 +13,10 @@ from lightning.pytorch.callbacks import Callback, WeightAveraging
 from torch.autograd.graph import increment_version
 
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.metrics import liquids, per_frame_mse
+from gpe_pl.metrics import liquids, open_scenes, per_frame_mse
 from gpe_pl.metrics.bodies import Bodies, body_metrics
 from gpe_pl.metrics.liquids import liquid_metrics, liquid_nodes
+from gpe_pl.metrics.open_scenes import open_metrics
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Start, rollouts
@@ -79,8 +80,8 @@ class RolloutValidation(Callback):
     """Rolls the current (averaged) model out on validation trajectories and logs the position MSE [m²] as ``val/rollout_mse``.
 
     If a rollout stops early, each missing frame has the error of the squared longest side of the domain. Meshes also get ``val/deformation_ratio`` and the
-    other ``BODY_METRICS``, and liquids the metrics of ``metrics.liquids``, as means over the trajectories whose truth has them. These metrics use only the
-    frames before a rollout stops.
+    other ``BODY_METRICS``, liquids the metrics of ``metrics.liquids``, and open scenes those of ``metrics.open_scenes``, as means over the trajectories whose
+    truth has them. These metrics use only the frames before a rollout stops.
 
     Put it before ``WarmAverage`` in the list of callbacks, so that it sees the averaged weights. Each rank takes some of the trajectories.
 
@@ -116,7 +117,8 @@ class RolloutValidation(Callback):
             )  # no max_speed: nodes that fast leave the domain
             starts.append(Start(simulator.initial_state(trajectory, history), truth.num_frames - 1, truth.metadata, guard))
         contained = Contained(simulator, self.trajectories[0].metadata.frame_dt) if self.containment else simulator
-        return list(zip(rollouts(contained, starts), truths, strict=True))
+        predicted = [own.with_nodes_of(truth) for own, truth in zip(rollouts(contained, starts), truths, strict=True)]
+        return list(zip(predicted, truths, strict=True))
 
     def _mse(self, pairs: list[tuple[Trajectory, Trajectory]]) -> float:
         means = []
@@ -135,10 +137,14 @@ class RolloutValidation(Callback):
             bodies, liquid = Bodies.of(truth), liquid_nodes(truth)
             if bodies is not None and steps:
                 found.append(body_metrics(bodies.predicted(prediction.frames(0, steps + 1)), bodies, steps))
-            if liquid.any() and steps:
+            if truth.alive is not None and steps:
+                found.append(open_metrics(prediction, truth, steps))
+            elif liquid.any() and steps:
                 found.append(liquid_metrics(prediction.pos[steps, liquid], truth.pos[steps, liquid], truth.mass[liquid], truth.metadata))
         everywhere = [values for part in ranks.gathered(found) for values in part]
-        named = {name: [values[name] for values in everywhere if name in values] for name in (*BODY_METRICS, *liquids.UNITS)}
+        named = {
+            name: [values[name] for values in everywhere if name in values] for name in (*BODY_METRICS, *liquids.UNITS, *open_scenes.UNITS)
+        }
         return {name: float(np.mean(values)) for name, values in named.items() if values}
 
 

@@ -21,12 +21,15 @@ from gpe_pl.learned.approximate import Batched
 from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.base import Prediction
+from gpe_pl.rollout.flow import through_openings
 from gpe_pl.rollout.loop import SimulationError, step_scenes
 from gpe_pl.system import ranks
 from gpe_pl.trajectory.state import State
 
 MOVED = ("pos", "vel", "velocity_history", "frame_velocity", "time")
 """Fields of a state that a step changes. A moving boundary changes, too, but follows from the number of steps."""
+OPEN = ("node_type", "mass", "material_params", "node_id", "next_id")
+"""Further fields that change in open scenes, where nodes enter and leave."""
 
 
 @dataclass
@@ -69,7 +72,9 @@ class Excursions:
         own: Stored = {lane: dict(scenes) for lane, scenes in self._loaded.items()}  # loaded from a checkpoint and not used since
         for lane, way in self._lanes.items():
             scenes = zip(way.samples, way.states, way.steps, strict=True)
-            own[lane] = {sample: {"steps": steps, **{name: getattr(state, name) for name in MOVED}} for sample, state, steps in scenes}
+            own[lane] = {
+                sample: {"steps": steps, **{name: getattr(state, name) for name in _moving(state)}} for sample, state, steps in scenes
+            }
         together: Stored = {}
         for part in ranks.gathered(own):
             for lane, stored in part.items():
@@ -131,13 +136,20 @@ class Excursions:
             predicted: prediction for the lane's last ``graphs``.
         """
         under_way = self._lanes[lane]
-        under_way.states = simulator.later(under_way.states, under_way.rows, predicted.to(under_way.states[0].pos.device))
+        later = simulator.later(under_way.states, under_way.rows, predicted.to(under_way.states[0].pos.device))
+        pairs = zip(under_way.states, later, strict=True)
+        under_way.states = [through_openings(state, after) if after.openings else after for state, after in pairs]
         under_way.steps = [step + 1 for step in under_way.steps]
         under_way.rows = []
 
 
+def _moving(state: State) -> tuple[str, ...]:
+    """Return the names of the fields that a checkpoint needs of an unroll."""
+    return MOVED if state.node_id is None else (*MOVED, *OPEN)
+
+
 def _moved(start: State, scene: dict[str, Any]) -> State:
-    """Return the state of a start with the fields in ``MOVED`` replaced by those of a checkpoint.
+    """Return the state of a start with the fields that move replaced by those of a checkpoint.
 
     Most models, and older checkpoints, have no ``frame_velocity``.
 
@@ -145,10 +157,12 @@ def _moved(start: State, scene: dict[str, Any]) -> State:
         CheckpointError: a field has another shape or type.
     """
     values: dict[str, Any] = {}
-    for name in MOVED:
-        there, here = scene.get(name) if name == "frame_velocity" else scene[name], getattr(start, name)
+    is_open = start.node_id is not None
+    for name in _moving(start):
+        there, here = scene.get(name) if name in ("frame_velocity", *OPEN) else scene[name], getattr(start, name)
         if isinstance(here, Tensor) and not (name == "frame_velocity" and there is None):
-            if not (isinstance(there, Tensor) and there.shape == here.shape and there.dtype == here.dtype):
+            fits = isinstance(there, Tensor) and there.shape[is_open:] == here.shape[is_open:] and there.dtype == here.dtype
+            if not fits:
                 raise CheckpointError(
                     f"last.ckpt: excursions.{name} does not fit the training data; delete the file to train from the start"
                 )

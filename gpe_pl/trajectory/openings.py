@@ -3,11 +3,13 @@
 An opening lies at one side of the scene and has its depth along the axis of that side. It either prescribes a speed or removes nodes:
 
 - Nodes in an opening with a ``speed`` move with it along the axis, whatever acts on them. With a positive speed, new nodes enter at the outer face. With a
-  negative speed, nodes leave when they pass the outer face.
+  negative speed, nodes leave when they pass the outer face. The speed may change in time (``speeds``), also its sign.
 - An opening without a speed removes every node that is in it after a frame.
 
 New nodes lie on a lattice that moves with the speed, so their places follow from the time alone. Layer k of the lattice is at the distance
-``(k + 1/2) spacing + speed time`` from the outer face. Layers with k ≥ 0 are in the opening at the start of the scene (``nodes_at_start``).
+``(k + 1/2) spacing + travel(time)`` from the outer face, where ``travel`` is the integral of the speed. Layers with k ≥ 0 are in the opening at the start
+(``nodes_at_start``). While the speed is negative, layers leave. The nodes that are nearest to a layer leave with it. The next layer that enters is therefore
+at least half a spacing from all other nodes.
 """
 
 from __future__ import annotations
@@ -26,6 +28,13 @@ from gpe_pl.schema import LARGEST
 ROUNDING = 1e-6
 """Fraction of a spacing by which sums of frame intervals may be wrong, so that a layer enters in the frame that exact times give."""
 
+ON_FACE = 1e-5
+"""Fraction of its depth by which an opening is deeper for the question which nodes are in it. Layers often lie exactly on its inner face."""
+LATER = {"speeds"}
+"""Attributes that files have only if they are not empty. The first files with openings lack them."""
+MOST_SPEEDS = 10_000
+"""Maximum number of pairs of ``Opening.speeds``."""
+
 
 @dataclass(frozen=True)
 class Opening:
@@ -34,11 +43,13 @@ class Opening:
     Attributes:
         low, high: corners of the box [dim].
         side: side of the box that is the outer face, such as ``x_low``.
-        speed: speed of its nodes into the scene [m/s], negative out of it; None for an opening that removes nodes.
+        speed: speed of its nodes into the scene [m/s], negative out of it; None for an opening that removes nodes, or if ``speeds`` are given.
         spacing: distance of new nodes; 0 if none enter, as for the attributes below.
         node_type: code of the material of new nodes.
         mass: mass of a new node [kg].
         params: material parameters of a new node, in the columns of the scene; None where its material lacks the parameter.
+        speeds: pairs of a time since the start of the scene [s], ascending, and the speed then [m/s]. Between them the speed is linear, before and after them
+            constant. Empty for a speed that does not change.
     """
 
     low: tuple[float, ...]
@@ -49,6 +60,7 @@ class Opening:
     node_type: int = 0
     mass: float = 0.0
     params: tuple[float | None, ...] = ()
+    speeds: tuple[tuple[float, float], ...] = ()
 
     @property
     def axis(self) -> int:
@@ -65,10 +77,35 @@ class Opening:
         return self.high[self.axis] - self.low[self.axis]
 
     @property
-    def velocity(self) -> np.ndarray:
-        """Velocity of its nodes [dim] in m/s; zero without a speed."""
+    def drives(self) -> bool:
+        """Whether it prescribes the motion of its nodes."""
+        return self.speed is not None or bool(self.speeds)
+
+    def speed_at(self, time: float) -> float:
+        """Return the speed [m/s] at a time since the start of the scene [s]; 0 if it prescribes none."""
+        if not self.speeds:
+            return self.speed or 0.0
+        return float(np.interp(time, *zip(*self.speeds, strict=True)))
+
+    def travel(self, time: float) -> float:
+        """Return the integral of the speed [m] from the start of the scene to a time [s]."""
+        if not self.speeds:
+            return (self.speed or 0.0) * time
+        knots = np.array([0.0, *(t for t, _ in self.speeds if 0 < t < time), time])
+        values = np.array([self.speed_at(t) for t in knots])
+        return float(np.sum(np.diff(knots) * (values[1:] + values[:-1]) / 2))
+
+    def velocity_at(self, time: float) -> np.ndarray:
+        """Return the velocity of its nodes [dim] in m/s at a time [s]; zero without a speed."""
+        return self._along(self.speed_at(time))
+
+    def mean_velocity(self, start: float, end: float) -> np.ndarray:
+        """Return the mean velocity of its nodes [dim] in m/s between two times [s]; zero without a speed."""
+        return self._along((self.travel(end) - self.travel(start)) / (end - start) if self.speeds else self.speed or 0.0)
+
+    def _along(self, speed: float) -> np.ndarray:
         velocity = np.zeros(len(self.low))
-        velocity[self.axis] = self.inward * (self.speed or 0.0)
+        velocity[self.axis] = self.inward * speed
         return velocity
 
     def moved(self, by: np.ndarray) -> Opening:
@@ -84,14 +121,21 @@ class Opening:
         return np.where(beside, np.inf, self.inward * (pos[:, self.axis] - face))
 
     def contains(self, pos: np.ndarray) -> np.ndarray:
-        """Return a mask [node] of the points [node, dim] in the box."""
-        depth = self.depth_of(pos)
-        return np.asarray((depth >= 0) & (depth <= self.depth))
+        """Return a mask [node] of the points [node, dim] in the box; the faces along the axis belong to it, also if positions are rounded to float32."""
+        depth, margin = self.depth_of(pos), ON_FACE * self.depth
+        return np.asarray((depth >= -margin) & (depth <= self.depth + margin))
 
-    def removes(self, pos: np.ndarray) -> np.ndarray:
-        """Return a mask [node] of the nodes at ``pos`` [node, dim] that leave: those in the box, if there is no speed, and up to a depth beyond its face."""
-        depth = self.depth_of(pos)
-        return np.asarray((depth >= -self.depth) & (depth < (self.depth if self.speed is None else 0.0)))
+    def removes(self, pos: np.ndarray, start: float, end: float) -> np.ndarray:
+        """Return a mask [node] of the nodes that leave between two times [s], given their positions at the end ``pos`` [node, dim] in m.
+
+        Without a speed, those in the box leave. With one, those up to a depth beyond the outer face leave, and with a layer that leaves those nearest to it.
+        """
+        depth, limit = self.depth_of(pos), 0.0
+        if not self.drives:
+            limit = self.depth
+        elif self.enters and self._num_layers(end) < self._num_layers(start):
+            limit = self._depth_of_layer(-self._num_layers(end), end) - self.spacing / 2
+        return np.asarray((depth >= -self.depth) & (depth < limit))
 
     @property
     def num_in_layer(self) -> int:
@@ -100,8 +144,8 @@ class Opening:
 
     @property
     def enters(self) -> bool:
-        """Whether new nodes enter."""
-        return self.speed is not None and self.speed > 0 and self.spacing > 0
+        """Whether new nodes enter at some time."""
+        return self.spacing > 0 and any(speed > 0 for speed in (self.speed or 0.0, *(speed for _, speed in self.speeds)))
 
     def nodes_at_start(self) -> np.ndarray:
         """Return the positions [node, dim] in m of the lattice in the box at time 0."""
@@ -117,12 +161,15 @@ class Opening:
         return self._nodes(np.arange(last - 1, first - 1, -1), end)
 
     def _num_layers(self, time: float) -> int:
-        """Return how many layers have passed the outer face between the start of the scene and a time."""
-        return math.floor((self.speed or 0.0) * time / self.spacing + 0.5 + ROUNDING)
+        """Return how many layers have passed the outer face between the start of the scene and a time; negative if layers left."""
+        return math.floor(self.travel(time) / self.spacing + 0.5 + ROUNDING)
+
+    def _depth_of_layer(self, layer: int, time: float) -> float:
+        return max(0.0, (layer + 0.5) * self.spacing + self.travel(time))
 
     def _nodes(self, layers: np.ndarray, time: float) -> np.ndarray:
         face = self.low[self.axis] if self.inward > 0 else self.high[self.axis]
-        depth = np.maximum(0.0, (layers + 0.5) * self.spacing + (self.speed or 0.0) * time)
+        depth = np.array([self._depth_of_layer(int(layer), time) for layer in layers])
         layer = self._layer()
         pos = np.tile(layer, (len(layers), 1))
         pos[:, self.axis] = face + self.inward * np.repeat(depth, len(layer))
@@ -140,7 +187,8 @@ class Opening:
 
 def openings_to_json(openings: Sequence[Opening]) -> str:
     """Convert openings to text, from which ``openings_from_json`` rebuilds them."""
-    return json.dumps([asdict(opening) for opening in openings], sort_keys=True)
+    values = [asdict(opening) for opening in openings]
+    return json.dumps([{key: v for key, v in own.items() if key not in LATER or v} for own in values], sort_keys=True)
 
 
 def openings_from_json(text: str) -> tuple[Opening, ...]:
@@ -150,7 +198,7 @@ def openings_from_json(text: str) -> tuple[Opening, ...]:
         ValueError: the text is no JSON, or a key is missing, unknown or of another type.
     """
     values, known = parsed(text), {f.name for f in fields(Opening)}
-    if not isinstance(values, list) or not all(isinstance(v, dict) and set(v) == known for v in values):
+    if not isinstance(values, list) or not all(isinstance(v, dict) and known - LATER <= set(v) <= known for v in values):
         raise ValueError(f"must be a list of openings with the keys {', '.join(sorted(known))}")
     return TypeAdapter(tuple[Opening, ...]).validate_json(text, strict=True)
 
@@ -185,6 +233,10 @@ def _fault(opening: Opening, dim: int, num_params: int, num_types: int) -> str |
         return f"side is {opening.side!r}, must be one of {', '.join(sides)}"
     if opening.speed is not None and not is_number(opening.speed):
         return f"speed is {opening.speed!r}, must be a number of m/s or null"
+    if opening.speeds and (wrong := speeds_fault(opening.speeds)) is not None:
+        return f"speeds {wrong}"
+    if opening.speeds and opening.speed is not None:
+        return f"speed is {opening.speed!r}, must be null beside speeds"
     if not is_number(opening.spacing) or opening.spacing < 0:
         return f"spacing is {opening.spacing!r}, must be at least 0"
     if not opening.enters:
@@ -196,4 +248,16 @@ def _fault(opening: Opening, dim: int, num_params: int, num_types: int) -> str |
     params = opening.params
     if len(params) != num_params or not all(p is None or is_number(p) for p in params):
         return f"params are {params!r}, must be one number or null for each of {num_params} columns"
+    return None
+
+
+def speeds_fault(speeds: Sequence[tuple[float, float]]) -> str | None:
+    """Describe what is wrong with a table of times [s] and speeds [m/s]; None if nothing is."""
+    if len(speeds) > MOST_SPEEDS:
+        return f"have {len(speeds)} pairs, at most {MOST_SPEEDS} are read"
+    for number, (time, speed) in enumerate(speeds, 1):
+        if not (abs(time) < LARGEST and abs(speed) < LARGEST):
+            return f"pair {number} is ({time!r}, {speed!r}), must be a time [s] and a speed [m/s]"
+        if number > 1 and time <= speeds[number - 2][0]:
+            return f"pair {number} is at {time:g} s, must be later than {speeds[number - 2][0]:g} s"
     return None

@@ -24,7 +24,7 @@ class Prescribed:
     """Faces with a prescribed velocity, and the openings that prescribe it.
 
     Attributes:
-        openings: openings with a speed.
+        openings: openings with a speed, each with its mean velocity in the frame [dim] in m/s.
         axes, cells: axis of each face, and the cell above it [face].
         below: cell below each face [face].
         velocity: velocity of each face along its axis [face] in m/s.
@@ -32,7 +32,7 @@ class Prescribed:
         is_inside: whether a cell belongs to an opening [cell].
     """
 
-    openings: tuple[Opening, ...]
+    openings: tuple[tuple[Opening, np.ndarray], ...]
     axes: np.ndarray
     cells: np.ndarray
     below: np.ndarray
@@ -41,20 +41,20 @@ class Prescribed:
     is_inside: np.ndarray
 
     @staticmethod
-    def of(openings: tuple[Opening, ...], grid: Grid, solids: Solids) -> Prescribed | None:
-        """Return the faces that openings prescribe; None if none has a speed.
+    def of(openings: tuple[Opening, ...], time: float, frame_dt: float, grid: Grid, solids: Solids) -> Prescribed | None:
+        """Return the faces that openings prescribe in the frame that begins at a time [s]; None if none has a speed.
 
         Raises:
             SimulationError: with reason ``input``, if an opening contains the centre of no cell.
         """
-        driven = tuple(opening for opening in openings if opening.speed is not None)
+        driven = tuple((opening, opening.mean_velocity(time, time + frame_dt)) for opening in openings if opening.drives)
         if not driven:
             return None
         lines = [o + grid.spacing * (np.arange(n) + 0.5) for o, n in zip(grid.origin, grid.counts, strict=True)]
         centres = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, grid.dim)
         is_inside, velocity = np.zeros(grid.num_cells, bool), np.zeros((grid.dim, grid.num_cells))
         prescribed = np.zeros((grid.dim, grid.num_cells), bool)
-        for opening in driven:
+        for opening, mean in driven:
             own = np.flatnonzero(opening.contains(centres))
             if not len(own):
                 raise SimulationError(
@@ -65,7 +65,7 @@ class Prescribed:
             is_inside[own] = True
             for axis, stride in enumerate(grid.strides):
                 for face in (own, own + stride):
-                    prescribed[axis, face], velocity[axis, face] = True, opening.velocity[axis]
+                    prescribed[axis, face], velocity[axis, face] = True, mean[axis]
         axes, cells = np.nonzero(prescribed & (solids.area > 0))
         return Prescribed(driven, axes, cells, cells - grid.strides[axes], velocity[axes, cells], solids.area[axes, cells], is_inside)
 
@@ -91,6 +91,6 @@ class Prescribed:
 
     def carry(self, start: np.ndarray, pos: np.ndarray, vel: np.ndarray, h: float) -> None:
         """Move the particles that were in an opening at ``start`` [node, dim] with its velocity for a time h [s], in place."""
-        for opening in self.openings:
+        for opening, mean in self.openings:
             inside = opening.contains(start)
-            pos[inside], vel[inside] = start[inside] + h * opening.velocity, opening.velocity
+            pos[inside], vel[inside] = start[inside] + h * mean, mean

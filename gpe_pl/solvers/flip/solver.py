@@ -202,7 +202,7 @@ class FLIP:
         """
         viscosity_of_node = self._check(state)
         solids = self.solids(state.boundary)
-        prescribed = Prescribed.of(state.openings, self.grid, solids) if state.openings else None
+        prescribed = Prescribed.of(state.openings, state.time, self.frame_dt, self.grid, solids) if state.openings else None
         # np.array copies: the kernels work in place, and the caller's arrays must not change
         pos, vel = np.array(state.pos, dtype=np.float64, order="C"), np.array(state.vel, dtype=np.float64, order="C")
         gravity, mass = np.array(state.gravity, dtype=np.float64), np.array(state.mass, dtype=np.float64)

@@ -32,7 +32,7 @@ def channel() -> Trajectory:
     pos = INLET.nodes_at_start()
     count = len(pos)
     state = State(
-        pos, np.tile(INLET.velocity, (count, 1)), np.full(count, INLET.node_type, np.uint8), np.full(count, 2.0), np.full((count, 1), 30.0),
+        pos, np.tile(INLET.velocity_at(0.0), (count, 1)), np.full(count, INLET.node_type, np.uint8), np.full(count, 2.0), np.full((count, 1), 30.0),
         Boundary.sample(domain_walls(BOUNDS, 0.0), 0.1, 2), np.zeros(2), param_names=("friction_angle",),
     )  # fmt: skip
     metadata = Metadata("channel", ("sand",), ("friction_angle",), DT, 0.1, 0.2, BOUNDS, (0.0, 0.0), split="test")

@@ -32,7 +32,7 @@ def channel(*openings: Opening, shapes: tuple[Box, ...] = ()) -> State:
     count = len(pos)
     boundary = Boundary.sample(shapes, 0.1, 2) if shapes else Boundary.empty(2)
     state = State(
-        pos, np.tile(INLET.velocity, (count, 1)), np.full(count, SAND, np.uint8), np.full(count, 2.0, np.float32),
+        pos, np.tile(INLET.velocity_at(0.0), (count, 1)), np.full(count, SAND, np.uint8), np.full(count, 2.0, np.float32),
         np.full((count, 1), 30.0, np.float32), boundary, np.zeros(2), param_names=("friction_angle",),
     )  # fmt: skip
     return state.opened(openings)

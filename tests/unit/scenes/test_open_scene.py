@@ -52,6 +52,41 @@ def test_a_flow_rate_is_a_speed_times_a_cross_section() -> None:
     assert [opening.speed for opening in state.openings] == [pytest.approx(2.0), pytest.approx(-0.5)]
 
 
+def test_tables_of_speeds_and_flow_rates() -> None:
+    table = [[0, 0.25], [1, 0.5], [2, -0.125]]
+    state, _ = tap(speed=None, flow_rate=table).outlet(**OUTLET, speed=[(0, 0), (1, 2)]).state(model())
+    inlet, outlet = state.openings
+    assert inlet.speed is None
+    assert inlet.speeds == ((0.0, 2.0), (1.0, 4.0), (2.0, -1.0))
+    assert outlet.speeds == ((0.0, 0.0), (1.0, -2.0))
+    assert inlet.enters
+    assert not outlet.enters
+    assert (state.vel == (0.0, -2.0)).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"speed": [[0, 1], [0, 2]]}, "inlet 1 (sand): speed: pair 2 is at 0 s, must be later than 0 s"),
+        ({"speed": [[0, -1], [1, 0]]}, "inlet 1 (sand): speed: has no positive value, so nothing would pass"),
+        (
+            {"speed": "fast"},
+            "inlet 1 (sand): speed='fast': must be a positive number, or pairs of a time [s] and a value, such as [[0, 0.5], [1, 1.5]]",
+        ),
+        ({"speed": [[0, True]]}, "inlet 1 (sand): speed=[[0, True]]: must be a positive number, or pairs of a time [s] and a value"),
+    ],
+)
+def test_impossible_tables_get_one_clear_line(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(SceneFault, match=re.escape(message)):
+        tap(**changes).state(model())
+
+
+def test_outlets_let_nothing_in() -> None:
+    message = "outlet 2: speed: has a negative value; an inlet takes material out while its speed is negative, and needs its material for the rest"
+    with pytest.raises(SceneFault, match=re.escape(message)):
+        tap().outlet(**OUTLET, speed=[[0, 1], [1, -1]])
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -103,6 +138,8 @@ def test_a_scene_file_has_openings(tmp_path: Path) -> None:
     from_file, from_python = (scene.state(model())[0] for scene in (read_scene(path), tap().outlet(**OUTLET)))
     assert from_file.openings == from_python.openings
     np.testing.assert_array_equal(from_file.pos, from_python.pos)
+    path.write_text(path.read_text().replace("speed: 1.5", "speed: [[0, 1.5], [1, -1]]"))
+    assert read_scene(path).state(model())[0].openings[0].speeds == ((0.0, 1.5), (1.0, -1.0))
     path.write_text("box: [1.0, 1.0]\nopenings:\n  - {inlet: sand, at: [0.25, 0.875], size: [0.125, 0.125], speed: 1.5}\n")
     with pytest.raises(SceneFault, match=re.escape("inlet 1 (sand): side: missing")):
         read_scene(path)

@@ -22,7 +22,7 @@ def tap(*openings: Opening) -> State:
     pos = TAP.nodes_at_start()
     count = len(pos)
     state = State(
-        pos, np.tile(TAP.velocity, (count, 1)), np.full(count, TAP.node_type, np.uint8), np.full(count, TAP.mass), np.full((count, 1), 30.0),
+        pos, np.tile(TAP.velocity_at(0.0), (count, 1)), np.full(count, TAP.node_type, np.uint8), np.full(count, TAP.mass), np.full((count, 1), 30.0),
         Boundary.sample(domain_walls(BOUNDS, 0.5), SPACING, 2), np.array([0.0, -9.81]), param_names=("friction_angle",),
     )  # fmt: skip
     return state.opened(openings)
