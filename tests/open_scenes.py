@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ def open_state() -> State:
     inlets = [opening for opening in OPENINGS if opening.enters]
     pos = [opening.nodes_at_start() for opening in inlets]
 
-    def of_inlets(values: list[object]) -> np.ndarray:
+    def of_inlets(values: list[Any]) -> np.ndarray:
         return np.concatenate([np.full((len(own), *np.shape(value)), value) for own, value in zip(pos, values, strict=True)])
 
     state = State(

@@ -450,7 +450,7 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             rigid_body=trajectory.rigid_body,
             loads=trajectory.loads_at(history),
         )
-        rows, alive = slice(None), None
+        rows, alive = np.arange(state.num_nodes), None
         if self.is_open:
             alive = np.ones(truth.shape[:2], bool) if trajectory.alive is None else trajectory.alive
             state, rows = _living(state, trajectory, history)

@@ -161,8 +161,7 @@ def _moved(start: State, scene: dict[str, Any]) -> State:
     for name in _moving(start):
         there, here = scene.get(name) if name in ("frame_velocity", *OPEN) else scene[name], getattr(start, name)
         if isinstance(here, Tensor) and not (name == "frame_velocity" and there is None):
-            fits = isinstance(there, Tensor) and there.shape[is_open:] == here.shape[is_open:] and there.dtype == here.dtype
-            if not fits:
+            if not (isinstance(there, Tensor) and there.shape[is_open:] == here.shape[is_open:] and there.dtype == here.dtype):
                 raise CheckpointError(
                     f"last.ckpt: excursions.{name} does not fit the training data; delete the file to train from the start"
                 )

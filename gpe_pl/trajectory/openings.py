@@ -85,7 +85,8 @@ class Opening:
         """Return the speed [m/s] at a time since the start of the scene [s]; 0 if it prescribes none."""
         if not self.speeds:
             return self.speed or 0.0
-        return float(np.interp(time, *zip(*self.speeds, strict=True)))
+        times, speeds = zip(*self.speeds, strict=True)
+        return float(np.interp(time, times, speeds))
 
     def travel(self, time: float) -> float:
         """Return the integral of the speed [m] from the start of the scene to a time [s]."""

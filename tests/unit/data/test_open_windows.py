@@ -42,11 +42,11 @@ def data(tmp_path: Path, trajectory: Trajectory) -> WindowDataset:
     return dataset(tmp_path, [trajectory])
 
 
-def dataset(root: Path, trajectories: list[Trajectory], noise: Noise | None = None, **settings: object) -> WindowDataset:
+def dataset(root: Path, trajectories: list[Trajectory], noise: Noise | None = None, **settings: Any) -> WindowDataset:
     write_shard(root / "train" / "shard-00000.h5", trajectories)
     stored = usable(open_split(root, "train"))
     builder = GraphBuilder(GraphConfig(history=HISTORY), stored[0].window(0, 1).metadata)
-    return WindowDataset(stored, builder, noise, 0.1, **settings)  # type: ignore[arg-type]
+    return WindowDataset(stored, builder, noise, 0.1, **settings)
 
 
 def test_a_window_is_the_graph_of_the_rollout(data: WindowDataset, trajectory: Trajectory) -> None:
@@ -114,7 +114,7 @@ def test_unrolls_follow_identities(data: WindowDataset) -> None:
 
 
 def _numpy(state: State) -> State:
-    arrays = {name: value.numpy() for name, value in vars(state).items() if isinstance(value, torch.Tensor)}
+    arrays: dict[str, Any] = {name: value.numpy() for name, value in vars(state).items() if isinstance(value, torch.Tensor)}
     return replace(state, **arrays)
 
 
@@ -136,13 +136,13 @@ def test_starts_reach_other_processes(data: WindowDataset) -> None:
 
 
 def test_open_and_closed_scenes_go_into_one_batch(tmp_path: Path, trajectory: Trajectory) -> None:
-    nodes = np.flatnonzero(trajectory.alive[0]) if trajectory.alive is not None else []
-    closed = replace(trajectory.of_nodes(np.isin(np.arange(trajectory.num_nodes), nodes)), alive=None, openings=())
+    assert trajectory.alive is not None
+    closed = replace(trajectory.of_nodes(trajectory.alive[0]), alive=None, openings=())
     data = dataset(tmp_path, [trajectory, closed])
     first, second = data[0], data[len(data) - 1]
     assert not second["sand"].without_target.any()
-    batch = collated([first, second])
-    assert batch["sand"].without_target.tolist() == [*first["sand"].without_target.tolist(), *[False] * len(nodes)]
+    batch: Any = collated([first, second])
+    assert batch["sand"].without_target.tolist() == [*first["sand"].without_target.tolist(), *[False] * closed.num_nodes]
 
 
 def test_statistics_count_nodes_while_they_are_there(trajectory: Trajectory) -> None:
@@ -181,7 +181,7 @@ def test_activity_counts_nodes_while_they_are_there(tmp_path: Path, trajectory: 
     ],
 )
 def test_settings_that_need_nodes_that_stay_are_refused(
-    tmp_path: Path, trajectory: Trajectory, settings: dict[str, object], message: str
+    tmp_path: Path, trajectory: Trajectory, settings: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(OpenScenesError, match=message):
         dataset(tmp_path, [trajectory], **settings)

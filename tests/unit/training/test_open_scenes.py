@@ -17,7 +17,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.open_scenes import present
 from gpe_pl.models.gpe import GPE
-from gpe_pl.rollout.loop import rollout
+from gpe_pl.rollout.loop import rollout, steps
 from gpe_pl.system.compiled import unfused
 from gpe_pl.training.callbacks import RolloutValidation
 from gpe_pl.training.module import TrainingModule
@@ -55,17 +55,12 @@ def test_unrolls_go_through_the_openings(data: WindowDataset, simulator: Learned
         expected = data[key].state
         first = expected.num_nodes
         assert state.node_id is not None
-        for _ in range(4):
-            (expected,) = [rollout_step(simulator, expected)]
+        assert expected.node_id is not None
+        *_, expected = steps(simulator, expected, 4)
+        assert expected.node_id is not None
         assert torch.equal(state.node_id, expected.node_id)
         torch.testing.assert_close(state.pos, expected.pos, rtol=0, atol=1e-7)
         assert state.num_nodes != first
-
-
-def rollout_step(simulator: LearnedSimulator, state):  # type: ignore[no-untyped-def]
-    from gpe_pl.rollout.loop import steps
-
-    return next(iter(steps(simulator, state, 1)))
 
 
 def test_a_checkpoint_goes_on_with_the_nodes_that_are_there(data: WindowDataset, simulator: LearnedSimulator) -> None:
