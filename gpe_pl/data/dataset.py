@@ -20,7 +20,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.noise import Noise
-from gpe_pl.data.open_windows import carried, check_settings, continued
+from gpe_pl.data.open_windows import check_settings, continued
 from gpe_pl.data.solver_targets import SolverTargets
 from gpe_pl.data.statistics import FRAMES_AT_ONCE
 from gpe_pl.data.training_samples import Unroll, UnrollStart, training_graph
@@ -28,6 +28,7 @@ from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.rollout.loop import Restartable
 from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.openings import carried
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import StoreError, UnsoundError, open_field, open_group, open_shard, read_trajectory, shards, trajectory_names
 from gpe_pl.trajectory.trajectory import Trajectory

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
 from gpe_pl.errors import GpeError
-from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.trajectory import Trajectory
 
 
@@ -46,8 +43,3 @@ def continued(window: Trajectory) -> Float64[np.ndarray, "frame node dim"]:
     column = np.arange(pos.shape[1])
     way = (frames - nearest)[..., None] * window.metadata.frame_dt * window.vel[nearest, column].astype(np.float64)
     return pos[nearest, column] + way
-
-
-def carried(openings: Sequence[Opening], pos: np.ndarray) -> Bool[np.ndarray, " node"]:
-    """Return a mask of the nodes at ``pos`` [node, dim] in m that an opening moves with its speed, whatever a model predicts."""
-    return np.any([np.zeros(len(pos), bool), *(opening.contains(pos) for opening in openings if opening.drives)], axis=0)

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
-from gpe_pl.data.open_windows import carried
 from gpe_pl.data.solver_targets import SolverTargets
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.topology import Topology
 from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.openings import carried
 from gpe_pl.trajectory.state import State
 
 

@@ -13,6 +13,7 @@ from gpe_pl.graphs.neighbors import Points, radius_between, radius_pairs
 from gpe_pl.graphs.topology import IslandTopology, Topology
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, MATERIALS, RADIUS, EdgeType, FeatureSpec, node_code
+from gpe_pl.trajectory.openings import carried
 from gpe_pl.trajectory.state import State
 
 Rows = dict[str, Tensor]
@@ -55,6 +56,8 @@ def find_topology(
     touched = walls[1]
     if state.loads is not None:  # what holds a prescribed node acts from outside, as walls do
         touched = np.concatenate([touched, state.loads.rows])
+    if state.openings:  # and so does an opening that moves its nodes
+        touched = np.concatenate([touched, np.flatnonzero(carried(state.openings, points.pos))])
     boundary_rows = None
     if config.trim_boundary:
         walls, boundary_rows = _trimmed(walls, state.boundary.pos.shape[0])

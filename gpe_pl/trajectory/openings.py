@@ -186,6 +186,11 @@ class Opening:
         return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(self.low))
 
 
+def carried(openings: Sequence[Opening], pos: np.ndarray) -> np.ndarray:
+    """Return a mask [node] of the nodes at ``pos`` [node, dim] in m that an opening moves with its speed, whatever a model predicts."""
+    return np.any([np.zeros(len(pos), bool), *(opening.contains(pos) for opening in openings if opening.drives)], axis=0)
+
+
 def openings_to_json(openings: Sequence[Opening]) -> str:
     """Convert openings to text, from which ``openings_from_json`` rebuilds them."""
     values = [asdict(opening) for opening in openings]

@@ -14,7 +14,7 @@ import torch
 from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.dataset import StartKey, WindowDataset, collated, damage, open_split, usable
 from gpe_pl.data.noise import Noise
-from gpe_pl.data.open_windows import OpenScenesError, carried, continued
+from gpe_pl.data.open_windows import OpenScenesError, continued
 from gpe_pl.data.statistics import acceleration_std, motion
 from gpe_pl.data.training_samples import UnrollStart
 from gpe_pl.graphs.builder import GraphBuilder
@@ -23,6 +23,7 @@ from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.rollout.baselines import Ballistic
 from gpe_pl.rollout.loop import steps
 from gpe_pl.solvers.flip import FLIP
+from gpe_pl.trajectory.openings import carried
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
