@@ -4,16 +4,21 @@
 where all of it comes from (``provenance.json``). It keeps the results of single rollouts in two small files (``gpe_pl.reports.run_archive``), from which
 ``python -m gpe_pl.reports docs/results/NAME`` makes the tables again. NOTE is what a reader should know besides, such as other work on the machine.
 RUN_FOLDER may also hold several evaluations by ``evaluate``, and their table by ``python -m gpe_pl.reports RUN_FOLDER``.
+``python docs/embed_results.py --renew SUITE_FOLDER NAME [NOTE]`` renews the models that a run of ``suite=acceptance`` or ``suite=stability`` measured, and
+keeps what ``docs/results/NAME`` has of other models.
 ``python docs/embed_results.py`` only renews the README and the list in ``docs/results/README.md``; ``--check`` fails if one differs from the files.
 """
 
 from __future__ import annotations
 
+import importlib
+import json
 import lzma
 import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from PIL import Image, ImageSequence
 
@@ -80,6 +85,47 @@ def collect(run: Path, name: str, note: str = "") -> None:
     sealed.write(target / PROVENANCE, {"sessions": every, "seeds": seeds, "note": note})
 
 
+def renew(run: Path, name: str, note: str = "") -> None:
+    """Replace the records and figures of the models of a suite's run in ``docs/results/{name}``, and make its table again.
+
+    Raises:
+        ValueError: the run has not measured all that the folder has of its models.
+    """
+    target = RESULTS / name
+    old, new = (json.loads((folder / "results.json").read_text()) for folder in (target, run))
+    old["records"] = renewed(old["records"], new["records"])
+    about = {key: value for key, value in old.items() if key != "records"}
+    lines = ",\n".join(json.dumps(own) for own in old["records"])
+    (target / "results.json").write_text(f'{json.dumps(about)[:-1]}, "records": [\n{lines}\n]}}\n')
+    suite = importlib.import_module(f"gpe_pl.benchmarks.{run.name}.suite")
+    (target / "table.md").write_text(suite.report(old["records"]) + "\n")
+    for pattern in PICTURES:
+        for path in sorted(run.glob(pattern)):
+            picture(path, target / path.name)
+    before = sealed.read(target / PROVENANCE, ADVICE)
+    sealed.write(target / PROVENANCE, {**before, "sessions": [*before["sessions"], *sessions(run)], "note": note or before["note"]})
+
+
+def renewed(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The old records, in which those of the models of the new records are replaced, test by test or scene by scene."""
+    parts: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for own in new:
+        parts.setdefault(_part(own), []).append(own)
+    models, found = {own["model"] for own in new}, list[dict[str, Any]]()
+    for own in old:
+        if own["model"] not in models:
+            found.append(own)
+        elif _part(own) in parts:
+            found += parts.pop(_part(own))
+        elif _part(own) not in map(_part, found):
+            raise ValueError(f"{' '.join(_part(own))}: not measured again; run all that the results have of this model")
+    return [*found, *(own for rest in parts.values() for own in rest)]
+
+
+def _part(own: dict[str, Any]) -> tuple[str, str]:
+    return own["model"], own.get("scene", own.get("test", ""))
+
+
 def record(source: Path, folder: Path) -> None:
     """Copy a file to a folder. JSON and CSV files of more than ``MAX_BYTES`` bytes, which nobody reads as text, are compressed with xz."""
     content = source.read_bytes()
@@ -139,10 +185,12 @@ def pages() -> dict[Path, str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Collect, embed or check; the exit status."""
+    """Collect, renew, embed or check; the exit status."""
     if arguments == ["--check"]:
         return int(any(path.read_text() != text for path, text in pages().items()))
-    if arguments:
+    if arguments[:1] == ["--renew"]:
+        renew(Path(arguments[1]), *arguments[2:])
+    elif arguments:
         collect(Path(arguments[0]), *arguments[1:])
     for path, text in pages().items():
         path.write_text(text)

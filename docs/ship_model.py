@@ -3,6 +3,9 @@
 ``python docs/ship_model.py RUN_FOLDER NAME COMMIT 'COMMAND'`` writes weights without the optimiser's state, and a model card whose numbers are the run's
 own, to ``gpe_pl/learned/pretrained``. COMMAND is what trained it, with the code of COMMIT.
 
+``python docs/ship_model.py RUN_FOLDER/checkpoints/last.ckpt NAME COMMIT 'COMMAND' EVALUATION…`` ships the last checkpoint instead of the best one. The numbers
+are those of folders in which ``python -m gpe_pl.evaluate`` evaluated this checkpoint.
+
 ``python docs/ship_model.py --verdicts RUN_FOLDER`` takes the results of ``python -m gpe_pl.benchmark suite=acceptance`` or ``suite=stability size=small`` on
 shipped models from the suite's folder, stores them beside the checkpoints, and begins the cards with what fails.
 
@@ -19,7 +22,7 @@ import numpy as np
 
 from gpe_pl.evaluation.metric_rows import LEARNED, Row, read_rows
 from gpe_pl.learned import verdicts
-from gpe_pl.learned.pretrained import FOLDER
+from gpe_pl.learned.pretrained import BEST, FOLDER, fingerprint
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.verdicts import Suite
 from gpe_pl.reports.domain_table import EVALUATED, NOT_LEARNED
@@ -30,8 +33,10 @@ SUITES: tuple[Suite, ...] = ("acceptance", "stability")
 REFUSED = "Other frame intervals and spacings are refused."
 
 
-def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows: list[Row], settings: dict[str, object]) -> str:
-    """The model card."""
+def card(
+    name: str, command: str, commit: str, simulator: LearnedSimulator, rows: list[Row], settings: dict[str, object], is_last: bool = False
+) -> str:
+    """The model card; ``is_last``: the weights are those after the last step, not those with the best validation."""
     metadata, model = simulator.builder.metadata, type(simulator.model).__name__
     size = sum(p.numel() for p in simulator.parameters())
     ranges = [f"| {kind} | {values} |" for kind, values in simulator.described_training()]
@@ -42,7 +47,8 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
         f"{model} with {size:,} parameters, for {', '.join(metadata.materials)} in {metadata.dim}D: data set `{metadata.dataset}`, "
         f"frames of {1e3 * metadata.frame_dt:g} ms, nodes {metadata.spacing:.4g} m apart. {REFUSED}{_law(simulator)}{_resting(simulator)}",
         "",
-        f"Trained with `{command}` (commit {commit}), {training['num_steps']:,} steps of {training['batch_size']} graphs.",
+        f"Trained with `{command}` (commit {commit}), {training['num_steps']:,} steps of {training['batch_size']} graphs."
+        f"{' These are the weights after the last step, not those with the best validation.' if is_last else ''}",
         "",
         "| trained range | |",
         "|---|---|",
@@ -113,6 +119,27 @@ def _opening(name: str, headline: str) -> list[str]:
     return [f"# {name}", "", f"**{headline[0].upper()}{headline[1:].replace('|', '/').replace('*', '')}.**", ""]
 
 
+def shipped(run: Path, name: str, commit: str, command: str, *evaluations: str) -> None:
+    """Write checkpoint and card of a run's best checkpoint, or of another file in the run's folder ``checkpoints`` that was evaluated.
+
+    Raises:
+        ValueError: an evaluation is of another checkpoint, or there is none of this checkpoint.
+    """
+    checkpoint = run if run.is_file() else run / BEST
+    folder, simulator = checkpoint.parent.parent, LearnedSimulator.from_checkpoint(checkpoint)
+    if checkpoint.name != BEST.name and not evaluations:
+        raise ValueError(f"{checkpoint}: name folders with evaluations of this checkpoint")
+    settings, own = json.loads((folder / "config.json").read_text()), [*map(Path, evaluations)]
+    for evaluation in own:
+        config = json.loads((evaluation / "config.json").read_text())
+        if config["checkpoint"] != fingerprint(checkpoint):
+            raise ValueError(f"{evaluation}: evaluates {config['checkpoint']}, not {fingerprint(checkpoint)}")
+        settings["evaluation"] = config["evaluation"]
+    rows = [row for found in own or [folder] for row in read_rows(found / "metrics.csv")]
+    simulator.save(FOLDER / f"{name}.ckpt")
+    (FOLDER / f"{name}.md").write_text(card(name, command, commit, simulator, rows, settings, checkpoint.name != BEST.name))
+
+
 def judged(results: Path) -> None:
     """Store results of suites on shipped models beside their checkpoints, and write what fails into their cards.
 
@@ -164,11 +191,7 @@ def main(arguments: list[str]) -> int:
     if arguments[0] == "--static-friction":
         rested(arguments[1], float(arguments[2]))
         return 0
-    run, (name, commit, command) = Path(arguments[0]), arguments[1:]
-    simulator = LearnedSimulator.from_checkpoint(run / "checkpoints" / "best.ckpt")
-    settings = json.loads((run / "config.json").read_text())
-    simulator.save(FOLDER / f"{name}.ckpt")
-    (FOLDER / f"{name}.md").write_text(card(name, command, commit, simulator, list(read_rows(run / "metrics.csv")), settings))
+    shipped(Path(arguments[0]), *arguments[1:])
     return 0
 
 

@@ -78,3 +78,13 @@ def test_pictures_are_smaller_and_look_the_same(tmp_path: Path) -> None:
             image.convert("L").resize((1, 1)).getpixel((0, 0)), abs=3
         )
     assert (tmp_path / "after.png").stat().st_size < (tmp_path / "before.png").stat().st_size / 2
+
+
+def test_records_of_other_models_are_kept() -> None:
+    renewed = runpy.run_path(str(ROOT / "docs" / "embed_results.py"))["renewed"]
+    old = [{"model": m, "scene": s, "value": k} for m, s, k in (("a", "x", 0), ("a", "x", 1), ("a", "y", 2), ("b", "x", 3))]
+    new = [{"model": "a", "scene": s, "value": k} for s, k in (("x", 10), ("y", 11), ("y", 12))]
+    assert [own["value"] for own in renewed(old, new)] == [10, 11, 12, 3]
+    assert [own["value"] for own in renewed(old, [*new, {"model": "a", "scene": "z", "value": 13}])] == [10, 11, 12, 3, 13]
+    with pytest.raises(ValueError, match="a x: not measured again"):
+        renewed(old, new[1:])

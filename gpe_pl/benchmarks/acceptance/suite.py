@@ -86,7 +86,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
         if path.parent != FOLDER:
             verdicts.write(verdicts.path_beside(path, "acceptance"), verdict)
     parts.clear()
-    return records, _report(records)
+    return records, report(records)
 
 
 def _candidates(checkpoints: Sequence[str], specs: dict[str, DatasetSpec]) -> list[tuple[Candidate, Path]]:
@@ -135,7 +135,7 @@ def failures(records: Sequence[dict[str, Any]]) -> list[str]:
     return [f"{r['model']}: {r['name']} {r['measured']}" for r in records if not r["passed"]]
 
 
-def _report(records: Sequence[dict[str, Any]]) -> str:
+def report(records: Sequence[dict[str, Any]]) -> str:
     """Return a line per model, and a table of its checks; failures come first."""
     lines = []
     for model in dict.fromkeys(r["model"] for r in records):

@@ -115,7 +115,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
         for label, _, path in _models(spec, settings):
             _write_verdict(path, [r for r in records if (r["domain"], r["model"]) == (name, label)], folder)
     parts.clear()
-    return records, _report(records, untested)
+    return records, report(records, untested)
 
 
 def _write_verdict(path: Path, records: Sequence[dict[str, Any]], folder: Path) -> None:
@@ -260,7 +260,7 @@ def failures(records: Sequence[dict[str, Any]]) -> list[str]:
 MARKS = {"passed": "passed", "failed": "**failed**", "not_applicable": "–"}
 
 
-def _report(records: Sequence[dict[str, Any]], untested: Sequence[str] = ()) -> str:
+def report(records: Sequence[dict[str, Any]], untested: Sequence[str] = ()) -> str:
     """Return counts, also for each model, and a table per domain with a row per test and a column per model."""
     gating = [r for r in records if r["gating"]]
     lines = [

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import math
+import shutil
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-from gpe_pl.evaluation.metric_rows import LEARNED, Row
+from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
+from gpe_pl.learned.pretrained import checkpoint_path, fingerprint
 from gpe_pl.learned.simulator import LearnedSimulator
 
 
@@ -39,3 +42,26 @@ def test_a_card_says_how_bodies_bend(ship_model: ModuleType) -> None:
     unclamped = {**settings, "evaluation": {"clamp_parameters": False}}
     assert "`evaluation.clamp_parameters=false`" in ship_model.card("fem", "python -m gpe_pl.fit", "abc", simulator, errors, unclamped)
     assert "Medians" not in ship_model.card("fem", "python -m gpe_pl.fit", "abc", simulator, errors, settings)
+
+
+def test_the_last_checkpoint_is_shipped_with_its_own_evaluations(
+    ship_model: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ship_model, "FOLDER", tmp_path)
+    last, evaluation = tmp_path / "run" / "checkpoints" / "last.ckpt", tmp_path / "evaluation"
+    for folder in (last.parent, evaluation):
+        folder.mkdir(parents=True)
+    shutil.copy(checkpoint_path("snow"), last)
+    (tmp_path / "run" / "config.json").write_text(json.dumps({"training": {"num_steps": 10, "batch_size": 2}}))
+    write_rows(evaluation / "metrics.csv", [*rows("rollout_mse", 1.0), *rows("rollout_mse", 4.0, model="ballistic")])
+    with pytest.raises(ValueError, match="name folders with evaluations"):
+        ship_model.shipped(last, "new", "abc", "python -m gpe_pl.fit")
+    config = {"checkpoint": "last.ckpt (sha256 0123456789ab)", "evaluation": {}}
+    (evaluation / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match="evaluates last.ckpt .*, not last.ckpt"):
+        ship_model.shipped(last, "new", "abc", "python -m gpe_pl.fit", str(evaluation))
+    (evaluation / "config.json").write_text(json.dumps({**config, "checkpoint": fingerprint(last)}))
+    ship_model.shipped(last, "new", "abc", "python -m gpe_pl.fit", str(evaluation))
+    text, weights = (tmp_path / "new.md").read_text(), LearnedSimulator.from_checkpoint("snow").state_dict()
+    assert "weights after the last step" in text and "have 25 % of the mean error" in text
+    assert all(bool((weights[k] == v).all()) for k, v in LearnedSimulator.from_checkpoint(tmp_path / "new.ckpt").state_dict().items())
