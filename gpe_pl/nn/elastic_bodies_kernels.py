@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from gpe_pl.nn.elastic_kernels import LOG_SMALLEST, move_forward
-from gpe_pl.trajectory.strain import SMALLEST_RATIO
+from gpe_pl.trajectory.strain import HEXAHEDRON, POINTS_TO_CORNERS, SMALLEST_RATIO
 
 KEPT = 2
 """Number of substeps in memory."""
@@ -153,11 +153,11 @@ def _write_stress(pos, lam, mu, nodes, gradient, volume, unit, stress):
     rows, columns = (
         (np.array([0, 0, 1, 2]), np.array([0, 1, 1, 2])) if dim == 2 else (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))
     )
-    own = np.empty(components)
+    num_points, corners = volume.shape[1], nodes.shape[1]
+    own, at_corner = np.empty((num_points, components)), np.empty(components)
     for cell in range(len(nodes)):
-        own[:] = 0.0
         size = 0.0
-        for q in range(volume.shape[1]):
+        for q in range(num_points):
             ratio = _deformation(pos, nodes, gradient, cell, q, f)
             safe = max(ratio, SMALLEST_RATIO)
             volumetric = lam[cell] * math.log(safe) - mu[cell]
@@ -168,12 +168,18 @@ def _write_stress(pos, lam, mu, nodes, gradient, volume, unit, stress):
                 i, j, left = rows[k], columns[k], 0.0
                 for m in range(3):
                     left += f[i, m] * f[j, m]
-                own[k] += volume[cell, q] * (mu[cell] * left + (volumetric if i == j else 0.0)) / safe
-        for a in range(nodes.shape[1]):
+                own[q, k] = (mu[cell] * left + (volumetric if i == j else 0.0)) / safe
+        for a in range(corners):
+            if a == 0 or corners == HEXAHEDRON:  # the corners of other cells have the same stress
+                at_corner[:] = 0.0
+                for q in range(num_points):
+                    weight = size * POINTS_TO_CORNERS[a, q] if corners == HEXAHEDRON else volume[cell, q]
+                    for k in range(components):
+                        at_corner[k] += weight * own[q, k]
             n = nodes[cell, a]
             whole[n] += size
             for k in range(components):
-                total[n, k] += own[k]
+                total[n, k] += at_corner[k]
     for n in range(num_nodes):
         for k in range(components):
             stress[n, k] = total[n, k] / whole[n] / unit if whole[n] > 0.0 else 0.0

@@ -31,7 +31,7 @@ from torch.autograd.function import once_differentiable
 
 from gpe_pl.nn.elastic_kernels import DEEPEST, LOG_SMALLEST, move_forward, pull_back
 from gpe_pl.nn.fused import works_on
-from gpe_pl.trajectory.strain import SMALLEST_RATIO, shape_gradients
+from gpe_pl.trajectory.strain import HEXAHEDRON, POINTS_TO_CORNERS, SMALLEST_RATIO, shape_gradients
 
 MAX_SUBSTEPS = 96
 """Largest number of substeps in a frame. Cells that need more are softened."""
@@ -346,7 +346,8 @@ def cauchy_stress(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> Flo
     """Return the elastic Cauchy stress at nodes, the mean over the cells around a node by rest volume; zero at nodes without a cell.
 
     Components are in the order of ``schema.STRESS_COMPONENTS``, in the unit of λ and μ. Where J is below ``SMALLEST_RATIO``, the stress is relative to that
-    fraction of the rest volume, as in ``solvers.fem.elements``.
+    fraction of the rest volume. A cell has its mean stress at all corners, as in ``solvers.fem.elements``. In hexahedra, which that solver does not have, the
+    stress at the quadrature points is extrapolated to each corner, as finite-element programs do: the stress of bending is largest at the surface.
 
     Args:
         pos: positions [m].
@@ -370,10 +371,15 @@ def cauchy_stress(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> Flo
         :, :, None, None
     ]
     rows, columns = ([0, 0, 1, 2], [0, 1, 1, 2]) if f.shape[-1] == 2 else ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
-    weighted = (cells.volume[:, :, None] * whole[:, :, rows, columns]).sum(dim=1)
-    where, count = cells.nodes.flatten(), cells.nodes.shape[1]
-    total = weighted.new_zeros(len(pos), len(rows)).index_add(0, where, weighted.repeat_interleave(count, dim=0))
-    volume = weighted.new_zeros(len(pos)).index_add(0, where, cells.volume.sum(dim=1).repeat_interleave(count))
+    where, count, size = cells.nodes.flatten(), cells.nodes.shape[1], cells.volume.sum(dim=1)
+    if count == HEXAHEDRON:
+        weighted = (
+            torch.einsum("aq,cqk->cak", torch.from_numpy(POINTS_TO_CORNERS).to(whole), whole[:, :, rows, columns]) * size[:, None, None]
+        )
+    else:
+        weighted = (cells.volume[:, :, None] * whole[:, :, rows, columns]).sum(dim=1, keepdim=True).expand(-1, count, -1)
+    total = weighted.new_zeros(len(pos), len(rows)).index_add(0, where, weighted.flatten(0, 1))
+    volume = weighted.new_zeros(len(pos)).index_add(0, where, size.repeat_interleave(count))
     return total / volume.clamp(min=torch.finfo(volume.dtype).tiny)[:, None]
 
 

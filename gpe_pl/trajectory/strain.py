@@ -27,6 +27,12 @@ _SIGNS = {
 }
 """Corners of the square and the cube from -1 to 1 in VTK's order, by dimension."""
 
+HEXAHEDRON = 8
+"""Number of corners of a hexahedron."""
+
+POINTS_TO_CORNERS = np.prod((1.0 + _SIGNS[3][:, None] * _SIGNS[3] / _GAUSS) / 2.0, axis=2)
+"""Weights that extrapolate values from the quadrature points of a hexahedron to its corners [corner, point], by the trilinear function through the points."""
+
 FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
 
