@@ -62,7 +62,7 @@ VELOCITY_RATIO = 1.25
 """A warning is given if displacements and velocities of a source differ by more than this factor."""
 FRAMES_COMPARED = 200
 """Number of first frames in which displacements and velocities are compared."""
-TYPED = ("gns", "lagrangebench", "meshgraphnets", "calculix")
+TYPED = ("gns", "lagrangebench", "meshgraphnets", "calculix", "meshio")
 """Formats with node types."""
 
 
@@ -84,6 +84,8 @@ def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Prog
     folder = _free_folder(Path(root), name)
     if settings.materials and settings.format not in TYPED:
         raise ImportFailure(f"materials={settings.materials}: {settings.format} has no node types; {', '.join(TYPED)} have")
+    if settings.arrays and settings.format != "meshio":
+        raise ImportFailure(f"arrays={settings.arrays}: only format=meshio finds arrays by their names")
     module = importlib.import_module(f"gpe_pl.data.importers.{settings.format}")
     source = arranged(module.open_source(path, settings), settings)
     if settings.max_trajectories is not None:

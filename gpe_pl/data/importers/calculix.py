@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from gpe_pl.data.importers import deck, frd
+from gpe_pl.data.importers.meshes import add_to_nodes, check_intervals, sizes
 from gpe_pl.data.importers.source import (
     Facts,
     ImportFailure,
@@ -43,14 +44,8 @@ from gpe_pl.schema import BOUNDARY, MATERIALS
 
 COMPONENTS = [0, 3, 5, 1, 4, 2]
 """Columns SXX, SYY, SZZ, SXY, SYZ, SZX of the results in the order xx, xy, xz, yy, yz, zz."""
-UNEVEN = 1e-3
-"""Frames are evenly spaced if their intervals differ by less than this fraction."""
-TETRAHEDRA = {
-    "tetrahedron": [[0, 1, 2, 3]],
-    "wedge": [[0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]],
-    "hexahedron": [[0, 1, 3, 4], [1, 2, 3, 6], [1, 3, 4, 6], [1, 4, 5, 6], [3, 4, 6, 7]],
-}
-"""Tetrahedra that fill each kind of cell."""
+SOLIDS = ("tetrahedron", "wedge", "hexahedron")
+"""Kinds of cells that are read."""
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
@@ -88,17 +83,14 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
     times = np.array([0.0, *results.times])
     if len(times) < 3:
         raise Refusal(f"has {len(times) - 1} results; write every frame with *NODE FILE, FREQUENCY=1")
-    steps = np.diff(times)
-    if np.ptp(steps) > UNEVEN * steps[0] or (facts.frame_dt and abs(steps[0] / facts.frame_dt - 1) > UNEVEN):
-        raise Refusal(
-            f"intervals between results are {steps.min():g} to {steps.max():g} s, expected {facts.frame_dt or steps[0]:g} s; use *DYNAMIC, DIRECT"
-        )
-    moved = _frames(results, "DISP", len(steps))
+    check_intervals(times, facts, "use *DYNAMIC, DIRECT")
+    count = len(results.times)
+    moved = _frames(results, "DISP", count)
     if moved is None:
         raise Refusal("has no displacements; write them with *NODE FILE and U")
-    volumes = [kind for kind in results.cells if kind not in TETRAHEDRA]
-    if volumes:
-        raise Refusal(f"has cells of kind {volumes[0]}; only solid elements C3D4, C3D6 and C3D8 are read")
+    others = [kind for kind in results.cells if kind not in SOLIDS]
+    if others:
+        raise Refusal(f"has cells of kind {others[0]}; only solid elements C3D4, C3D6 and C3D8 are read")
     number, mass, elastic, notes = _nodes(results, conditions)
     pos = results.rest_pos + np.concatenate([np.zeros((1, *results.rest_pos.shape)), moved])
     nodes = typed(pos, number, dict.fromkeys(np.unique(number).tolist(), "solid"), settings, cells=results.cells, rest_pos=results.rest_pos)
@@ -114,9 +106,9 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
     nodes.prescribed = prescribed if prescribed.any() else None
     force = conditions.force(results.node_ids, times)
     nodes.force = None if force is None else (force + np.concatenate([force[1:], force[-1:]])) / 2
-    if (velocity := _frames(results, "VELO", len(steps))) is not None:
+    if (velocity := _frames(results, "VELO", count)) is not None:
         nodes.vel = np.concatenate([np.zeros((1, *velocity.shape[1:])), velocity])
-    stress = _frames(results, "STRESS", len(steps))
+    stress = _frames(results, "STRESS", count)
     if stress is not None:
         nodes.stress = np.concatenate([np.zeros((1, *stress.shape[1:])), stress])[..., COMPONENTS]
     nodes.gravity = None if conditions.gravity is None else tuple(conditions.gravity.tolist())
@@ -142,20 +134,17 @@ def _nodes(results: frd.Results, conditions: deck.Deck) -> tuple[np.ndarray, np.
     number, mass, constants = np.zeros(count, int), np.zeros(count), np.zeros((2, count))
     notes, is_elastic = [], True
     for kind, cells in results.cells.items():
-        corners = results.rest_pos[cells]
-        edges = [corners[:, t[1:]] - corners[:, t[:1]] for t in np.array(TETRAHEDRA[kind])]
-        volume = sum(np.abs(np.linalg.det(e)) / 6 for e in edges)
+        volume = sizes(results.rest_pos, kind, cells)
         for material in np.unique(results.material[kind]).tolist():
             name, own = results.material_names.get(material, "").upper(), results.material[kind] == material
             if name not in conditions.density:
                 raise Refusal(f"material {name or material} has no *DENSITY, from which masses follow")
             is_elastic &= name in conditions.elastic
-            share = np.repeat(conditions.density[name] * np.asarray(volume)[own] / cells.shape[1], cells.shape[1])
-            rows = cells[own].ravel()
-            number[rows] = material
-            np.add.at(mass, rows, share)
+            share = conditions.density[name] * volume[own] / cells.shape[1]
+            number[cells[own]] = material
+            add_to_nodes(mass, cells[own], share)
             for k, value in enumerate(conditions.elastic.get(name, (0.0, 0.0))):
-                np.add.at(constants[k], rows, share * value)
+                add_to_nodes(constants[k], cells[own], share * value)
     if (mass == 0).any():
         raise Refusal(f"node {results.node_ids[int((mass == 0).argmax())]} belongs to no cell; leave it out of the deck")
     if not is_elastic:

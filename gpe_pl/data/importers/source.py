@@ -26,7 +26,7 @@ from gpe_pl.trajectory.arrays import estimated_normals, numbers
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.trajectory import Trajectory
 
-Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "calculix", "thermognn", "arrays"]
+Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "calculix", "meshio", "thermognn", "arrays"]
 
 SPLIT_NAMES = {"train": "train", "valid": "val", "validation": "val", "val": "val", "test": "test", "test_unseen": "test_unseen"}
 """Names of splits in the store, by their names in public data sets."""
@@ -77,6 +77,7 @@ class ImportSettings:
         walls: friction of walls at the bounds, by side (``x_low``, ``x_high``, …); ``{}`` for no walls.
         materials: material, or ``boundary``, of node types of the source, by their number. Other types keep the material of the format.
         parameters: parameters by material: a number for the first one, or several by name. Values that a trajectory of the source has itself override them.
+        arrays: names of arrays in the files of ``meshio``, by what they are, such as ``displacement``.
         max_trajectories: maximum number of trajectories per split, from its start.
         splits: numbers of the trajectories of each split, from 0 over all trajectories of the source; see ``splits.arranged``.
         leave_out: number of the trajectory that becomes ``test``, while all others are for training; one number after the other gives a leave-one-out test.
@@ -96,6 +97,7 @@ class ImportSettings:
     walls: dict[str, Annotated[float, Field(ge=0)]] | None = None
     materials: dict[int, str] | None = None
     parameters: dict[str, float | dict[str, float]] | None = None
+    arrays: dict[str, str] | None = None
     max_trajectories: Annotated[int, Field(ge=1)] | None = None
     splits: dict[Split, list[Annotated[int, Field(ge=0)]]] | None = None
     leave_out: Annotated[int, Field(ge=0)] | None = None

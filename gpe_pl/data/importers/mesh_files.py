@@ -1,0 +1,221 @@
+"""Reader of series of mesh files through meshio: PVD collections, XDMF series, Exodus files, and folders with a file per frame."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from gpe_pl.data.importers.source import Refusal, natural
+from gpe_pl.schema import CELL_KINDS
+
+XDMF, EXODUS = (".xdmf", ".xmf"), (".e", ".ex2", ".exo")
+ENDINGS = (".pvd", *XDMF, *EXODUS)
+"""Endings of files with all frames of a trajectory."""
+KINDS = {
+    "line": "line",
+    "triangle": "triangle",
+    "quad": "quadrilateral",
+    "tetra": "tetrahedron",
+    "wedge": "wedge",
+    "hexahedron": "hexahedron",
+}
+"""Kinds of cells by their names in meshio."""
+EXODUS_KINDS = {
+    "TRI": "triangle",
+    "QUA": "quad",
+    "SHE": "quad",
+    "TET": "tetra",
+    "WED": "wedge",
+    "HEX": "hexahedron",
+    "BAR": "line",
+    "BEA": "line",
+}
+"""Names in meshio of cells by the first three letters of their names in Exodus."""
+COMPONENTS = (("xx", "yy", "zz", "xy", "yz", "xz"), ("xx", "yy", "zz", "xy", "yz", "zx"), ("x", "y", "z"), ("x", "y"))
+"""Endings of the names of the components of tensors, in VTK's order, and of vectors."""
+WEDGE = [0, 2, 1, 3, 5, 4]
+"""Corners of a wedge in VTK's order, from the other orientation."""
+
+
+@dataclass
+class Frame:
+    """A frame of a series.
+
+    Attributes:
+        file: name of the file, for messages.
+        time: time [s]; None if the file has none.
+        points: points [point, axis] in m.
+        cells: nodes of the cells by kind of ``schema.CELL_KINDS`` [cell, corner].
+        point_data: values of points by name [point, …].
+        cell_data: values of cells by name and kind [cell, …].
+    """
+
+    file: str
+    time: float | None
+    points: np.ndarray
+    cells: dict[str, np.ndarray]
+    point_data: dict[str, np.ndarray]
+    cell_data: dict[str, dict[str, np.ndarray]]
+
+    @classmethod
+    def of(cls, file: str, time: float | None, mesh: Any) -> Frame:
+        """Return the frame of a ``meshio.Mesh``; points of their own are cells to meshio and are left out.
+
+        Raises:
+            Refusal: a kind of cells is not known.
+        """
+        points = np.asarray(mesh.points, np.float64)
+        cells: dict[str, list[np.ndarray]] = {}
+        data: dict[str, dict[str, list[np.ndarray]]] = {name: {} for name in mesh.cell_data}
+        for k, block in enumerate(mesh.cells):
+            if block.type == "vertex":
+                continue
+            if block.type not in KINDS:
+                raise Refusal(f"{file} has cells of kind {block.type}; cells must be linear: {', '.join(KINDS)}")
+            kind = KINDS[block.type]
+            cells.setdefault(kind, []).append(np.asarray(block.data, np.int64))
+            for name, values in mesh.cell_data.items():
+                data[name].setdefault(kind, []).append(np.asarray(values[k]))
+        whole = {kind: np.concatenate(parts) for kind, parts in cells.items()}
+        if "wedge" in whole:
+            whole["wedge"] = _outward(points, whole["wedge"])
+        cell_data = {name: {kind: np.concatenate(parts) for kind, parts in own.items()} for name, own in data.items()}
+        return cls(file, time, points, whole, {name: np.asarray(values) for name, values in mesh.point_data.items()}, cell_data)
+
+
+def _outward(points: np.ndarray, wedges: np.ndarray) -> np.ndarray:
+    """Return wedges in VTK's order: seen from outside, the corners of the first triangle run counter-clockwise. Formats differ in this."""
+    corners = points[wedges]
+    volume = np.linalg.det(corners[:, 1:4] - corners[:, :1])
+    return np.where((volume > 0)[:, None], wedges[:, WEDGE], wedges)
+
+
+def read_series(path: Path) -> list[Frame]:
+    """Read all frames of a trajectory.
+
+    Raises:
+        Refusal: a file is missing, damaged or of an unknown format, or has cells that are not linear.
+    """
+    if path.is_dir():
+        files = sorted((file for file in path.iterdir() if file.is_file()), key=lambda file: natural(file.name))
+        return [Frame.of(file.name, None, _mesh(file)) for file in files]
+    if path.suffix.lower() == ".pvd":
+        return [Frame.of(file.name, time, _mesh(file)) for time, file in _collection(path)]
+    reader: Callable[[Path], Iterator[tuple[float, Any]]] = _xdmf if path.suffix.lower() in XDMF else _exodus
+    with _readable(path):
+        return [Frame.of(path.name, time, mesh) for time, mesh in reader(path)]
+
+
+def times_of(path: Path) -> np.ndarray | None:
+    """Return the times of the frames of a trajectory; None if there are none or they cannot be read."""
+    if path.is_dir():
+        return None
+    try:
+        if path.suffix.lower() == ".pvd":
+            return np.array([time for time, _ in _collection(path)])
+        with _readable(path):
+            return np.array([time for time, _ in (_xdmf if path.suffix.lower() in XDMF else _exodus)(path)])
+    except Refusal:
+        return None
+
+
+@contextlib.contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Turn the various errors of readers, and their exits, into a refusal that names the file; what they print is dropped."""
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO()):
+            yield
+    except Refusal:
+        raise
+    except ModuleNotFoundError as error:
+        raise Refusal(f"{path.name} needs the package {error.name}; install it with `pip install {error.name}`") from None
+    except (Exception, SystemExit) as error:
+        reason = " ".join(printed.getvalue().split()) if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
+        raise Refusal(f"{path.name} cannot be read by meshio ({reason or 'it is damaged or of another format'})") from None
+
+
+def _mesh(path: Path) -> Any:
+    import meshio
+
+    with _readable(path):
+        return meshio.read(path)
+
+
+def _collection(path: Path) -> list[tuple[float, Path]]:
+    """Return times and files of a PVD collection; files lie below its folder.
+
+    Raises:
+        Refusal: the file is damaged or lists a file elsewhere.
+    """
+    with _readable(path):
+        entries = [(float(e.attrib["timestep"]), e.attrib["file"]) for e in ElementTree.parse(path).iter("DataSet")]
+    folder = path.parent.resolve()
+    for _, name in entries:
+        if not (folder / name).resolve().is_relative_to(folder):
+            raise Refusal(f"{path.name} lists {name}, which is not in its folder")
+    return [(time, folder / name) for time, name in sorted(entries)]
+
+
+def _xdmf(path: Path) -> Iterator[tuple[float, Any]]:
+    import meshio
+
+    with meshio.xdmf.TimeSeriesReader(path) as reader:
+        points, cells = reader.read_points_cells()
+        for k in range(reader.num_steps):
+            time, point_data, cell_data = reader.read_data(k)
+            yield time, meshio.Mesh(points, cells, point_data=point_data, cell_data=cell_data)
+
+
+def _exodus(path: Path) -> Iterator[tuple[float, Any]]:
+    """Yield times and meshes of an Exodus file [Schoof & Yarberry 1994]; meshio itself reads its first time only."""
+    import meshio
+    import netCDF4
+
+    with netCDF4.Dataset(path) as file:
+        file.set_auto_mask(False)
+        values = file.variables
+        axes = values["coord"][:] if "coord" in values else [values[f"coord{axis}"][:] for axis in "xyz" if f"coord{axis}" in values]
+        points = np.stack(list(axes), axis=1)
+        blocks = [k for k in range(1, len(values) + 1) if f"connect{k}" in values]
+        cells = [_exodus_cells(str(values[f"connect{k}"].elem_type), values[f"connect{k}"][:] - 1) for k in blocks]
+        of_points, of_cells = _names(values, "name_nod_var"), _names(values, "name_elem_var")
+        for t, time in enumerate(values["time_whole"][:]):
+            point_data = _grouped({name: values[f"vals_nod_var{k}"][t] for k, name in enumerate(of_points, start=1)})
+            by_block = [
+                _grouped({name: values[key][t] for k, name in enumerate(of_cells, start=1) if (key := f"vals_elem_var{k}eb{b}") in values})
+                for b in blocks
+            ]
+            everywhere = [name for name in (by_block[0] if by_block else ()) if all(name in own for own in by_block)]
+            cell_data = {name: [own[name] for own in by_block] for name in everywhere}
+            yield float(time), meshio.Mesh(points, cells, point_data=point_data, cell_data=cell_data)
+
+
+def _exodus_cells(kind: str, rows: np.ndarray) -> tuple[str, np.ndarray]:
+    """Return the name in meshio of a kind of cells in Exodus, or its own name if the cells are not linear, and the cells."""
+    name = EXODUS_KINDS.get(kind[:3].upper(), kind)
+    is_linear = name in KINDS and rows.shape[1] == CELL_KINDS[KINDS[name]][1]
+    return name if is_linear else kind, rows
+
+
+def _names(values: Any, key: str) -> list[str]:
+    return [b"".join(row).split(b"\0")[0].decode().strip() for row in values[key][:]] if key in values else []
+
+
+def _grouped(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return values by name, with vectors and tensors whose components are arrays of their own, such as ``disp_x`` and ``disp_y``, also as ``disp``."""
+    found, by_name = dict(values), {name.lower(): own for name, own in values.items()}
+    for endings in COMPONENTS:
+        for name in values:
+            stem = name[: -len(endings[0])]
+            parts = [by_name.get(stem.lower() + ending) for ending in endings]
+            if name.lower().endswith(endings[0]) and stem and all(part is not None for part in parts):
+                found.setdefault(stem.rstrip("_"), np.stack([part for part in parts if part is not None], axis=-1))
+    return found

@@ -1,0 +1,70 @@
+"""What importers of finite-element computations share: sizes of cells, masses and means at nodes, and frames at even intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from gpe_pl.data.importers.source import Facts, Refusal
+
+SIMPLICES = {
+    "line": [[0, 1]],
+    "triangle": [[0, 1, 2]],
+    "quadrilateral": [[0, 1, 2], [0, 2, 3]],
+    "tetrahedron": [[0, 1, 2, 3]],
+    "wedge": [[0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]],
+    "hexahedron": [[0, 1, 3, 4], [1, 2, 3, 6], [1, 3, 4, 6], [1, 4, 5, 6], [3, 4, 6, 7]],
+}
+"""Simplices that fill each kind of cell."""
+UNEVEN = 1e-3
+"""Frames are evenly spaced if their intervals differ by less than this fraction."""
+
+
+def sizes(rest_pos: Float[np.ndarray, "node dim"], kind: str, cells: np.ndarray) -> Float[np.ndarray, "cell"]:
+    """Return the lengths [m], areas [m²] or volumes [m³] of cells [cell, corner] of one kind."""
+    corners = rest_pos[cells]
+    edges = [corners[:, s[1:]] - corners[:, s[:1]] for s in np.array(SIMPLICES[kind])]
+    gram = np.array([np.linalg.det(e @ e.swapaxes(1, 2)) for e in edges])
+    return np.asarray(np.sqrt(np.maximum(gram, 0.0)).sum(axis=0) / math.factorial(edges[0].shape[1]))
+
+
+def add_to_nodes(total: np.ndarray, cells: np.ndarray, values: np.ndarray) -> None:
+    """Add a value of each cell [cell, …] to each of its nodes, in place."""
+    np.add.at(total, cells.ravel(), np.repeat(values, cells.shape[1], axis=0))
+
+
+def mean_at_nodes(rest_pos: np.ndarray, cells: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the mean [node, …] of the values of the cells around each node, weighted by the sizes of the cells; 0 at nodes without a cell.
+
+    Args:
+        rest_pos: positions at rest [node, dim] in m.
+        cells: nodes of the cells by kind [cell, corner].
+        values: values of the cells by kind [cell, …].
+    """
+    shape = next(iter(values.values())).shape[1:]
+    total, weight = np.zeros((len(rest_pos), *shape)), np.zeros(len(rest_pos))
+    for kind, own in cells.items():
+        size = sizes(rest_pos, kind, own)
+        add_to_nodes(total, own, values[kind] * size.reshape(-1, *[1] * len(shape)))
+        add_to_nodes(weight, own, size)
+    return np.asarray(total / np.where(weight > 0, weight, 1.0).reshape(-1, *[1] * len(shape)))
+
+
+def check_intervals(times: np.ndarray, facts: Facts, advice: str) -> None:
+    """Check that frames are ``facts.frame_dt`` apart, or evenly spaced if that is None.
+
+    Args:
+        times: times of the frames [frame] in s.
+        facts: facts of the data set.
+        advice: what to do if they are not.
+
+    Raises:
+        Refusal: intervals differ.
+    """
+    steps = np.diff(times)
+    expected = facts.frame_dt or steps[0]
+    if steps.min() <= 0 or np.ptp(steps) > UNEVEN * steps[0] or abs(steps[0] / expected - 1) > UNEVEN:
+        raise Refusal(f"intervals between results are {steps.min():g} to {steps.max():g} s, expected {expected:g} s; {advice}")

@@ -1,0 +1,254 @@
+"""Importer of computations of finite-element programs as series of VTK, VTU, XDMF or Exodus files, which the package meshio reads.
+
+``source`` is a folder with ``train/``, ``val/``, ``test/`` and ``test_unseen/``, or a folder of trajectories. A trajectory is
+
+- ``NAME.pvd`` with the VTU files that it lists, as ParaView writes them,
+- ``NAME.xdmf`` or ``NAME.xmf`` with a series in time,
+- ``NAME.e``, ``NAME.ex2`` or ``NAME.exo``: Exodus with all times, which also needs the package netCDF4, or
+- a folder ``NAME/`` with one file per frame in the order of their numbers, of any format that meshio reads; ``frame_dt`` has to be given.
+
+Arrays are found by their names. ``arrays={displacement: U, stress: S}`` names those that are called otherwise in the files:
+
+- ``displacement`` of points [point, axis] in m. If the points of the file are the same in all frames, displacements are added to them. If they move, they
+  are positions, and displacements lead back to the undeformed positions. Without displacements, points that move are positions.
+- ``velocity`` of points [point, axis] in m/s. Without it, velocities are differences of positions.
+- ``stress`` of points or cells: 6 components in VTK's order XX, YY, ZZ, XY, YZ, XZ, or 9. The stress of a cell goes to its nodes, as the mean by size of cells.
+- ``prescribed`` of points: not 0 where the motion is given, as in the first frame. ``force`` of points [point, axis] in N.
+- ``mass`` of points [kg], or ``density`` of points or cells [kg/m³]. Otherwise all masses are 1 kg, which does not suit forces.
+- ``material`` of points: numbers, which ``materials={1: elastomer}`` names. Without it, all have number 0, which is ``solid`` for meshes.
+- Parameters of materials at points or in cells, such as ``youngs_modulus`` and ``poisson_ratio``.
+
+Scenes whose points all have the third coordinate 0 are two-dimensional. Cells are lines, triangles, quadrilaterals, tetrahedra, wedges and hexahedra; others
+are refused. The importer needs ``meshio`` (``pip install 'gpe_pl[import]'``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.data.importers.mesh_files import ENDINGS, Frame, read_series, times_of
+from gpe_pl.data.importers.meshes import add_to_nodes, check_intervals, mean_at_nodes, sizes
+from gpe_pl.data.importers.source import (
+    Facts,
+    ImportFailure,
+    ImportSettings,
+    Item,
+    Loaded,
+    Nodes,
+    Refusal,
+    Source,
+    build,
+    natural,
+    split_folders,
+    typed,
+)
+from gpe_pl.errors.printable import did_you_mean
+from gpe_pl.schema import BOUNDARY, MATERIALS
+
+PARAMETERS = tuple(dict.fromkeys(p.name for own in MATERIALS.values() for p in own))
+ROLES = ("displacement", "velocity", "stress", "prescribed", "force", "mass", "density", "material", *PARAMETERS)
+"""What arrays can be."""
+COMPONENTS = {
+    (3, 6): [0, 3, 5, 1, 4, 2],
+    (3, 9): [0, 1, 2, 4, 5, 8],
+    (2, 6): [0, 3, 1, 2],
+    (2, 9): [0, 1, 4, 8],
+}
+"""Columns of a stress of 6 or 9 components in the order of ``schema.STRESS_COMPONENTS``, by dimension of space and number of components."""
+
+
+def open_source(path: Path, settings: ImportSettings) -> Source:
+    """Return the computations at ``path``.
+
+    Raises:
+        ImportFailure: there are none, ``arrays`` names an unknown role, or meshio is missing.
+    """
+    try:
+        import meshio  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ImportFailure(f"format=meshio: needs the package {error.name}; install it with `pip install 'gpe_pl[import]'`") from None
+    for role in settings.arrays or {}:
+        if role not in ROLES:
+            raise ImportFailure(f"arrays.{role}: unknown{did_you_mean(role, ROLES)}; arrays are {', '.join(ROLES)}")
+    folders, warnings = split_folders(path)
+    splits = {}
+    for split, folder in (folders or {"train": path}).items():
+        found = _trajectories(folder)
+        if found:
+            splits[split] = [Item(place.stem, partial(_load, place, settings)) for place in found]
+    if not splits:
+        wanted = ", ".join(f"*{ending}" for ending in ENDINGS)
+        raise ImportFailure(
+            f"{path}: {'no such folder' if not path.is_dir() else f'holds no {wanted} and no folders with a file per frame'}"
+        )
+    first = next(iter(splits.values()))[0].name
+    places = [place for folder in (folders.values() or [path]) for place in _trajectories(folder)]
+    times = next((t for place in places if (t := times_of(place)) is not None and len(t) > 1), None)
+    facts = Facts(frame_dt=None if times is None else float(times[1] - times[0])).overridden(settings)
+    if facts.frame_dt is None:
+        raise ImportFailure(f"frame_dt: {first} has no times; pass frame_dt=… [s]")
+    return Source(facts, splits, warnings)
+
+
+def _trajectories(folder: Path) -> list[Path]:
+    """Return files and folders that are a trajectory each; a folder beside a file of its name belongs to that file."""
+    if not folder.is_dir():
+        return []
+    files = [entry for entry in folder.iterdir() if entry.is_file() and entry.suffix.lower() in ENDINGS]
+    named = {file.stem for file in files}
+    folders = [entry for entry in folder.iterdir() if entry.is_dir() and entry.name not in named and not entry.name.startswith(".")]
+    return sorted([*files, *folders], key=lambda place: natural(place.name))
+
+
+def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
+    frames = read_series(path)
+    if len(frames) < 3:
+        raise Refusal(f"has {len(frames)} frames; a trajectory needs at least 3")
+    if frames[0].time is not None:
+        check_intervals(np.array([frame.time for frame in frames], float), facts, "write results at even intervals")
+    _check_same_mesh(frames)
+    arrays = _Arrays(frames, settings.arrays or {})
+    pos, rest = _positions(frames, arrays)
+    planar = not pos[..., 2:].any() and not rest[..., 2:].any() and not {"tetrahedron", "wedge", "hexahedron"} & {*frames[0].cells}
+    dim = 2 if planar else 3
+    pos, rest, cells = pos[..., :dim], rest[..., :dim], frames[0].cells
+    number = arrays.of_points("material")
+    types = np.zeros(pos.shape[1], int) if number is None else np.rint(number[0].reshape(pos.shape[1])).astype(int)
+    nodes = typed(pos, types, {0: "solid"} if cells else {}, settings, cells=cells or None, rest_pos=rest)
+    nodes.vel = _vectors(arrays, "velocity", dim)
+    nodes.force = _vectors(arrays, "force", dim)
+    prescribed = arrays.of_points("prescribed")
+    if prescribed is not None and prescribed[0].any():
+        nodes.prescribed = prescribed[0].reshape(pos.shape[1], -1).any(axis=1)
+    stress = arrays.at_points("stress", rest)
+    if stress is not None:
+        stress = stress.reshape(*stress.shape[:2], -1)
+        if (dim, stress.shape[2]) not in COMPONENTS:
+            raise Refusal(f"{arrays.name('stress')!r} has {stress.shape[2]} components, expected 6 (XX, YY, ZZ, XY, YZ, XZ) or 9")
+        nodes.stress = stress[..., COMPONENTS[dim, stress.shape[2]]]
+    _add_masses(nodes, arrays, rest, cells)
+    for material in {*nodes.kind.tolist()} - {BOUNDARY}:
+        own = {p.name: v[0].reshape(-1) for p in MATERIALS[material] if (v := arrays.at_points(p.name, rest)) is not None}
+        if own:
+            nodes.parameters = {**nodes.parameters, material: own}
+    return build(nodes, facts)
+
+
+def _check_same_mesh(frames: list[Frame]) -> None:
+    """Raise ``Refusal`` if a frame has other points or cells than the first."""
+    first = frames[0]
+    for k, frame in enumerate(frames):
+        if frame.points.shape != first.points.shape:
+            raise Refusal(f"{frame.file} has {len(frame.points)} points, {first.file} has {len(first.points)}; meshes must not change", k)
+        same = frame.cells.keys() == first.cells.keys() and all(
+            np.array_equal(frame.cells[kind], first.cells[kind]) for kind in first.cells
+        )
+        if not same:
+            raise Refusal(f"{frame.file} has other cells than {first.file}; meshes must not change", k)
+
+
+def _positions(frames: list[Frame], arrays: _Arrays) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions [frame, point, 3] and rest positions [point, 3], see the module."""
+    points = np.stack([_padded(frame.points) for frame in frames])
+    moved = arrays.of_points("displacement")
+    if moved is not None:
+        moved = _padded(moved.reshape(*points.shape[:2], -1))
+    if (points != points[:1]).any():
+        return points, points[0] if moved is None else points[0] - moved[0]
+    if moved is None:
+        raise Refusal(
+            f"{frames[0].file}: points do not move, and there are no displacements; name them with arrays={{displacement: …}} ({arrays.there()})"
+        )
+    return points + moved, points[0]
+
+
+def _padded(values: np.ndarray) -> np.ndarray:
+    """Return vectors [..., axis] with three axes, the missing ones 0."""
+    return np.concatenate([values, np.zeros((*values.shape[:-1], 3 - values.shape[-1]))], axis=-1)
+
+
+def _vectors(arrays: _Arrays, role: str, dim: int) -> np.ndarray | None:
+    """Return an array of vectors of points [frame, point, dim]; None if there is none."""
+    values = arrays.of_points(role)
+    if values is None:
+        return None
+    if values.ndim != 3 or values.shape[2] < dim:
+        raise Refusal(f"{arrays.name(role)!r} has shape {list(values.shape[1:])}, expected [point, {dim}]")
+    return values[..., :dim]
+
+
+def _add_masses(nodes: Nodes, arrays: _Arrays, rest: np.ndarray, cells: Mapping[str, np.ndarray]) -> None:
+    mass, density = arrays.of_points("mass"), arrays.at_points("density", rest)
+    if mass is not None:
+        nodes.mass = mass[0].reshape(-1)
+    elif density is not None and cells:
+        own, total = density[0].reshape(-1), np.zeros(len(rest))
+        for kind, rows in cells.items():
+            add_to_nodes(total, rows, own[rows].mean(axis=1) * sizes(rest, kind, rows) / rows.shape[1])
+        if (total == 0).any():
+            raise Refusal(
+                f"point {int((total == 0).argmax())} belongs to no cell, so it has no mass; leave it out or give {arrays.name('mass')!r}"
+            )
+        nodes.mass = total
+    else:
+        nodes.notes.append("masses are not in the source; 1 kg is stored for every node (arrays={mass: …} or arrays={density: …})")
+        if nodes.force is not None:
+            raise Refusal("has forces but no masses, and a model reads f/m; name them with arrays={mass: …} or arrays={density: …}")
+
+
+class _Arrays:
+    """Arrays of a series by role.
+
+    Args:
+        frames: the frames.
+        names: names in the files by role, where they differ.
+    """
+
+    def __init__(self, frames: list[Frame], names: Mapping[str, str]) -> None:
+        self.frames, self.names = frames, names
+
+    def name(self, role: str) -> str:
+        """Return the name of an array in the files."""
+        return self.names.get(role, role)
+
+    def there(self) -> str:
+        """Say which arrays the first frame has."""
+        points, cells = (", ".join(map(repr, found)) or "none" for found in (self.frames[0].point_data, self.frames[0].cell_data))
+        return f"point data: {points}; cell data: {cells}"
+
+    def of_points(self, role: str) -> np.ndarray | None:
+        """Return values of points [frame, point, …]; None if there are none.
+
+        Raises:
+            Refusal: a frame lacks the array or has another shape of it, or the settings name an array that is not there.
+        """
+        return self._stacked(role, [frame.point_data.get(self.name(role)) for frame in self.frames])
+
+    def at_points(self, role: str, rest: np.ndarray) -> np.ndarray | None:
+        """Return values of points, or the means of the values of cells around them [frame, point, …]; None if there are none."""
+        name = self.name(role)
+        if name in self.frames[0].point_data or name not in self.frames[0].cell_data:
+            return self.of_points(role)
+        found: list[Any] = []
+        for frame in self.frames:
+            values = frame.cell_data.get(name)
+            whole = values is not None and {*values} >= {*frame.cells}
+            found.append(mean_at_nodes(rest, frame.cells, values) if whole and values is not None else None)
+        return self._stacked(role, found)
+
+    def _stacked(self, role: str, found: list[Any]) -> np.ndarray | None:
+        name = self.name(role)
+        if found[0] is None:
+            if role in self.names:
+                raise Refusal(f"{self.frames[0].file} has no array {name!r} (arrays={{{role}: {name}}}); {self.there()}")
+            return None
+        for k, (frame, values) in enumerate(zip(self.frames, found, strict=True)):
+            if values is None or values.shape != found[0].shape:
+                wrong = "no array" if values is None else f"another shape {list(values.shape)} of"
+                raise Refusal(f"{frame.file} has {wrong} {name!r}, {self.frames[0].file} has one of shape {list(found[0].shape)}", k)
+        return np.stack(found).astype(np.float64)

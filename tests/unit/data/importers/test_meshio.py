@@ -1,0 +1,237 @@
+"""Series of VTU, XDMF, PVD and Exodus files become trajectories with clamps, forces, stress and masses; others are refused by file and array."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset
+from gpe_pl.export.trajectories import write_vtk
+from gpe_pl.trajectory.store import iter_trajectories
+from gpe_pl.trajectory.trajectory import Trajectory
+
+meshio = pytest.importorskip("meshio", reason="meshio is not installed")
+
+FRAMES, DT, SIZE, DENSITY = 7, 0.01, 0.1, 1200.0
+POINTS = SIZE * np.argwhere(np.ones((3, 2, 2)))
+CELLS = np.array([[0, 4, 6, 2, 1, 5, 7, 3], [4, 8, 10, 6, 5, 9, 11, 7]])
+FLAT = SIZE * np.argwhere(np.ones((3, 2, 1)))
+TRIANGLES = np.array([[0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3]])
+VTK = [0, 3, 5, 1, 4, 2]
+"""Components of a stress in the store's order, in VTK's order."""
+
+
+def displacement(points: np.ndarray) -> np.ndarray:
+    """Return displacements [frame, point, 3] that grow with the distance from the clamp."""
+    time = DT * np.arange(FRAMES)[:, None, None]
+    way = np.array([0.1, -1.0, 0.3]) * (np.ptp(points, axis=0) > 0)
+    return np.sin(40 * time) * (points[:, :1] ** 2) * way
+
+
+def stress(count: int) -> np.ndarray:
+    """Return values [frame, place, 6] in VTK's order, which tell their place."""
+    return 100.0 * np.arange(FRAMES)[:, None, None] + 10.0 * np.arange(count)[:, None] + np.arange(6)
+
+
+def force() -> np.ndarray:
+    values = np.zeros((FRAMES, len(POINTS), 3))
+    values[:, 8:, 1] = -np.arange(FRAMES)[:, None]
+    return values
+
+
+def arrays(frame: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the point data and cell data of a frame."""
+    points = {
+        "displacement": displacement(POINTS)[frame],
+        "velocity": displacement(POINTS)[frame] * 3,
+        "force": force()[frame],
+        "prescribed": (POINTS[:, 0] == 0).astype(float),
+    }
+    return points, {"S": [stress(2)[frame]], "density": [np.full(2, DENSITY)], "youngs_modulus": [np.array([1e5, 3e5])]}
+
+
+def write_folder(folder: Path, edit: Callable[[Any, int], Any] = lambda mesh, frame: mesh) -> None:
+    (folder / "beam").mkdir(parents=True)
+    for frame in range(FRAMES):
+        points, cells = arrays(frame)
+        mesh = edit(meshio.Mesh(POINTS, [("hexahedron", CELLS)], point_data=points, cell_data=cells), frame)
+        mesh.write(folder / "beam" / f"step_{frame}.vtu")
+
+
+def write_xdmf(folder: Path, power: float = 1.0) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    with meshio.xdmf.TimeSeriesWriter(folder / "beam.xdmf", data_format="XML") as writer:
+        writer.write_points_cells(POINTS, [("hexahedron", CELLS)])
+        for frame in range(FRAMES):
+            points, cells = arrays(frame)
+            writer.write_data(DT * frame**power, point_data=points, cell_data=cells)
+
+
+def imported(tmp_path: Path, **settings: Any) -> Trajectory:
+    given = ImportSettings("meshio", str(tmp_path / "raw"), "set", holdout=0.0, **settings)
+    report = import_dataset(tmp_path / "data", given)
+    assert not report.refusals
+    return next(iter_trajectories(tmp_path / "data" / "set" / "imported", "train"))
+
+
+@pytest.mark.parametrize("series", ["folders", "xdmf"])
+def test_a_series_of_meshio_becomes_a_trajectory(tmp_path: Path, series: str) -> None:
+    write_folder(tmp_path / "raw") if series == "folders" else write_xdmf(tmp_path / "raw")
+    found = imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT if series == "folders" else None)
+    assert (found.num_frames, found.metadata.materials) == (FRAMES, ("solid",))
+    assert found.metadata.frame_dt == pytest.approx(DT)
+    np.testing.assert_allclose(found.pos - found.pos[0], displacement(POINTS), atol=1e-6)
+    np.testing.assert_allclose(found.vel, 3 * displacement(POINTS), atol=1e-6)
+    assert found.cells is not None and found.cells.tolist() == CELLS.tolist() and found.cell_dim == 3
+    assert found.prescribed is not None and found.prescribed.tolist() == [True] * 4 + [False] * 8
+    assert found.force is not None and found.stress is not None
+    np.testing.assert_allclose(found.force, force(), rtol=1e-6)
+    np.testing.assert_allclose(found.mass, DENSITY * SIZE**3 / 8 * np.repeat([1, 2, 1], 4), rtol=1e-5)
+    np.testing.assert_allclose(found.material_params[:, 0], np.repeat([1e5, 2e5, 3e5], 4), rtol=1e-5)
+    of_cells = stress(2)
+    at_nodes = np.repeat(np.stack([of_cells[:, 0], of_cells.mean(axis=1), of_cells[:, 1]], axis=1), 4, axis=1)
+    np.testing.assert_allclose(found.stress.node, at_nodes[..., VTK], rtol=1e-5)
+
+
+def test_plane_meshes_with_points_that_move_and_nodes_with_stress(tmp_path: Path) -> None:
+    (tmp_path / "raw" / "a").mkdir(parents=True)
+    for frame in range(FRAMES):
+        data = {"stress": stress(6)[frame], "mass": np.full(6, 2.0), "material": np.full(6, 3)}
+        mesh = meshio.Mesh(FLAT + displacement(FLAT)[frame], [("triangle", TRIANGLES)], point_data=data)
+        mesh.write(tmp_path / "raw" / "a" / f"{frame}.vtk")
+    found = imported(tmp_path, frame_dt=DT, materials={3: "elastomer"}, parameters={"elastomer": 7e5})
+    assert (found.metadata.dim, found.metadata.materials) == (2, ("elastomer",))
+    np.testing.assert_allclose(found.pos - found.pos[0], displacement(FLAT)[..., :2], atol=1e-6)
+    assert found.stress is not None
+    np.testing.assert_allclose(found.stress.node, stress(6)[..., [0, 3, 1, 2]], rtol=1e-5)
+    np.testing.assert_allclose(found.mass, 2.0)
+
+
+def test_what_this_package_exports_comes_back(tmp_path: Path) -> None:
+    """Also wedges, whose corners meshio reads in another order."""
+    rest = np.random.default_rng(0).uniform(0, 0.1, (7, 3)) + np.array(
+        [[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 1], [0, 1, 1], [1, 0, 1], [2, 2, 2]]
+    )
+    swing = 0.01 * np.sin(np.arange(8)[:, None, None] + rest)
+    made = Trajectory.from_numpy(
+        rest + swing,
+        DT,
+        "elastomer",
+        {"elastomer": 4e5},
+        cells={"wedge": [[0, 1, 2, 3, 4, 5]], "tetrahedron": [[0, 1, 2, 6]]},
+        rest_pos=rest,
+        mass=3.0,
+    )
+    (tmp_path / "raw").mkdir()
+    write_vtk(tmp_path / "raw" / "a.pvd", made)
+    found = imported(tmp_path, materials={3: "elastomer"})
+    assert found.metadata.frame_dt == pytest.approx(DT)
+    np.testing.assert_allclose(found.pos - found.pos[0], made.pos - made.pos[0], atol=1e-6)
+    assert found.cells is not None and made.cells is not None and found.rest_pos is not None
+    assert sorted(found.cells.tolist()) == sorted(made.cells.tolist())
+    np.testing.assert_allclose(found.rest_pos - found.pos[0], rest - made.pos[0], atol=1e-6)
+    np.testing.assert_allclose(found.material_params[:, 0], 4e5)
+    np.testing.assert_allclose(found.mass, 3.0)
+
+
+def test_exodus_with_all_times(tmp_path: Path) -> None:
+    netcdf = pytest.importorskip("netCDF4", reason="netCDF4 is not installed")
+    (tmp_path / "raw").mkdir()
+    names = {"n": ["disp_x", "disp_y", "disp_z", "mass"], "e": [f"stress_{c}" for c in ("xx", "yy", "zz", "xy", "yz", "zx")]}
+    with netcdf.Dataset(tmp_path / "raw" / "beam.e", "w", format="NETCDF3_64BIT_OFFSET") as file:
+        for name, size in {"time_step": None, "node": 12, "len": 16, "cell": 2, "corner": 8, "n": 4, "e": 6}.items():
+            file.createDimension(name, size)
+        for k, axis in enumerate("xyz"):
+            file.createVariable(f"coord{axis}", "f8", ("node",))[:] = POINTS[:, k]
+        connect = file.createVariable("connect1", "i4", ("cell", "corner"))
+        connect.elem_type, connect[:] = "HEX8", CELLS + 1
+        time = file.createVariable("time_whole", "f8", ("time_step",))
+        texts = {
+            "n": file.createVariable("name_nod_var", "S1", ("n", "len")),
+            "e": file.createVariable("name_elem_var", "S1", ("e", "len")),
+        }
+        for key, own in names.items():
+            for k, name in enumerate(own):
+                texts[key][k] = [c.encode() for c in name.ljust(16, "\0")]
+        nodal = [file.createVariable(f"vals_nod_var{k + 1}", "f8", ("time_step", "node")) for k in range(4)]
+        of_cells = [file.createVariable(f"vals_elem_var{k + 1}eb1", "f8", ("time_step", "cell")) for k in range(6)]
+        for frame in range(FRAMES):
+            time[frame] = DT * frame
+            for k in range(3):
+                nodal[k][frame] = displacement(POINTS)[frame, :, k]
+            nodal[3][frame] = 2.0
+            for k in range(6):
+                of_cells[k][frame] = stress(2)[frame, :, k]
+    found = imported(tmp_path, arrays={"displacement": "disp"})
+    np.testing.assert_allclose(found.pos - found.pos[0], displacement(POINTS), atol=1e-6)
+    assert found.stress is not None and found.cells is not None and found.cells.tolist() == CELLS.tolist()
+    np.testing.assert_allclose(found.stress.node[:, 0], stress(2)[:, 0][:, VTK], rtol=1e-5)
+
+
+def without(name: str, at: int = 0) -> Callable[[Any, int], Any]:
+    def edit(mesh: Any, frame: int) -> Any:
+        if frame >= at:
+            mesh.point_data.pop(name, None)
+            mesh.cell_data.pop(name, None)
+        return mesh
+
+    return edit
+
+
+def quadratic(mesh: Any, frame: int) -> Any:
+    return meshio.Mesh(POINTS, [("line3", np.array([[0, 1, 2]]))], point_data=mesh.point_data)
+
+
+def flat_stress(mesh: Any, frame: int) -> Any:
+    mesh.cell_data["S"] = [np.ones((2, 3))]
+    return mesh
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (without("displacement"), r"step_0.vtu: points do not move, and there are no displacements; name them with arrays={displacement: .*'velocity'"),
+        (without("S"), r"step_0.vtu has no array 'S' \(arrays={stress: S}\); point data: 'displacement'.*cell data: 'density'"),
+        (without("velocity", 4), r"step_4.vtu has no array 'velocity', step_0.vtu has one of shape \[12, 3\]"),
+        (without("density"), r"has forces but no masses, and a model reads f/m; name them with arrays={mass: …} or arrays={density: …}"),
+        (quadratic, r"step_0.vtu has cells of kind line3; cells must be linear: line, triangle"),
+        (flat_stress, r"'S' has 3 components, expected 6 \(XX, YY, ZZ, XY, YZ, XZ\) or 9"),
+        (lambda mesh, frame: meshio.Mesh(POINTS[:8], [("hexahedron", CELLS[:1])]) if frame == 2 else mesh, r"step_2.vtu has 8 points, step_0.vtu has 12"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_used_is_refused_by_file_and_array(tmp_path: Path, edit: Callable[[Any, int], Any], message: str) -> None:
+    write_folder(tmp_path / "raw", edit)
+    with pytest.raises(ImportFailure, match=message):
+        imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
+
+
+def test_a_damaged_file_uneven_times_and_wrong_settings_are_named(tmp_path: Path) -> None:
+    write_folder(tmp_path / "raw")
+    (tmp_path / "raw" / "beam" / "step_3.vtu").write_text("<VTKFile")
+    with pytest.raises(ImportFailure, match=r"beam: step_3.vtu cannot be read by meshio \(it is damaged or of another format\)"):
+        imported(tmp_path, frame_dt=DT)
+    with pytest.raises(ImportFailure, match=r"frame_dt: beam has no times; pass frame_dt=… \[s\]"):
+        imported(tmp_path)
+    with pytest.raises(ImportFailure, match=r"arrays.displacemnt: unknown; did you mean 'displacement'\?"):
+        imported(tmp_path, arrays={"displacemnt": "U"})
+    write_xdmf(tmp_path / "raw" / "train", 1.1)
+    with pytest.raises(ImportFailure, match="intervals between results are .* write results at even intervals"):
+        imported(tmp_path)
+
+
+def test_a_collection_must_not_leave_its_folder(tmp_path: Path) -> None:
+    write_folder(tmp_path / "elsewhere")
+    (tmp_path / "raw").mkdir()
+    entries = "".join(f'<DataSet timestep="{frame}" file="../elsewhere/beam/step_{frame}.vtu"/>' for frame in range(FRAMES))
+    (tmp_path / "raw" / "a.pvd").write_text(f'<VTKFile type="Collection"><Collection>{entries}</Collection></VTKFile>')
+    with pytest.raises(ImportFailure, match=r"a.pvd lists ../elsewhere/beam/step_0.vtu, which is not in its folder"):
+        imported(tmp_path, frame_dt=DT)
+
+
+def test_names_of_arrays_belong_to_this_format(tmp_path: Path) -> None:
+    with pytest.raises(ImportFailure, match="only format=meshio finds arrays by their names"):
+        import_dataset(tmp_path, ImportSettings("gns", str(tmp_path), "set", arrays={"stress": "S"}))
