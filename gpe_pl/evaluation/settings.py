@@ -35,8 +35,8 @@ class EvaluationSettings:
         mirror_average: average each step over the scene and its mirror images (see ``learned.mirror_average``); None takes the model's own value.
         material_controls: roll scenes with unseen parameters out with other parameters, too (see ``material_controls``).
         num_pictures: number of trajectories per split that get a figure, an animation and a viewer. With 0, no curve of errors is drawn, either.
-        quantities: also write energy, momentum, run-out, bounce height and peak stress (see ``metrics.quantities``): over time for the trajectories with
-            pictures, and one number per trajectory as a table and parity plots.
+        quantities: also write energy, momentum, run-out, bounce height, deflection and peak stress (see ``metrics.quantities``): over time for the
+            trajectories with pictures, and one number per trajectory as a table and parity plots.
         export: what to write for other programs: the trajectories with pictures as ``vtk`` series, ``npz`` and ``mp4``, figures also as ``svg`` or ``pdf``,
             the ``model`` (see ``export.program``), its network as ``onnx`` (see ``export.onnx_network``), and a ``page`` on which the model runs in a
             browser (see ``export.play_page``), with films of these trajectories.

@@ -1,4 +1,4 @@
-"""Quantities that an engineer asks of a scene: energy, momentum, run-out, bounce height and peak stress, over time and as one number per scene.
+"""Quantities that an engineer asks of a scene: energy, momentum, run-out, bounce height, deflection and peak stress, over time and as one number per scene.
 
 Velocities are those of the frames, (x[t] − x[t−1]) / Δt, in predictions and ground truth alike. In 2D, energies, momenta and masses are per metre of depth.
 Axes without gravity are horizontal. In scenes without gravity all axes are, and there is no height.
@@ -43,6 +43,7 @@ def quantities(trajectory: Trajectory) -> dict[str, Quantity]:
     - ``run-out``: horizontal distance from the first centre of mass within which ``RUN_OUT_FRACTION`` of the mass is [m]; one number: at the end.
     - ``height``: height of the centre of mass above that in frame 1 [m].
     - ``bounce height``: rise of the centre of mass above its lowest earlier place, since it began to fall [m]; one number: the largest.
+    - ``deflection``, in scenes with nodes whose motion is given: largest distance of a node from its rest position [m]; one number: the largest.
     - ``peak stress``: largest von Mises stress of a node [Pa], where there is a stress; one number: the largest.
     """
     motion = mass_motion(trajectory, trajectory.num_frames - 1)
@@ -63,6 +64,10 @@ def quantities(trajectory: Trajectory) -> dict[str, Quantity]:
         found["potential energy"] = Quantity("J", mass * strength * height)
         found["height"] = Quantity("m", height)
         found["bounce height"] = Quantity("m", rise, float(rise.max()))
+    if trajectory.prescribed is not None:
+        rest = trajectory.pos[0] if trajectory.rest_pos is None else trajectory.rest_pos
+        bent = np.linalg.norm(trajectory.pos[1:].astype(np.float64) - rest, axis=-1).max(axis=1)
+        found["deflection"] = Quantity("m", bent, float(bent.max()))
     if trajectory.stress is not None:
         peak = von_mises(np.asarray(trajectory.stress.node[1:], np.float64)).max(axis=1)
         found["peak stress"] = Quantity("Pa", peak, float(peak.max()))
