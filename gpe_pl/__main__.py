@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import runpy
 import sys
@@ -23,6 +24,9 @@ VERBS: dict[str, tuple[str, str]] = {
     "benchmark": ("benchmark", "run a suite: times, acceptance, stress tests"),
 }
 """Module of each verb below ``gpe_pl``, which also runs as ``python -m gpe_pl.MODULE``, and what it does."""
+
+NAMED = ("demo", "play", "info")
+"""Verbs whose first argument can be a shipped model."""
 
 COMPLETION = """_gpe_complete() {
     local word="${COMP_LINE:0:COMP_POINT}"
@@ -66,13 +70,24 @@ def _run(verb: str, arguments: list[str]) -> None:
 
 
 def _complete() -> None:
-    """Print the words that can stand at the end of the line ``$COMP_LINE``: verbs, or what Hydra knows of a verb's configuration."""
+    """Print the words that can stand at the end of the line ``$COMP_LINE``: verbs, keys and shipped models, or what Hydra knows of a verb's configuration."""
     words = os.environ.get("COMP_LINE", "").split(" ")[1:]
     if len(words) < 2:
         print(" ".join(VERBS))
-    elif words[0] in VERBS and "." not in VERBS[words[0]][0]:
+    elif words[0] in VERBS and "." in VERBS[words[0]][0]:
+        print(" ".join(_words_without_hydra(words[0], words[-1])))
+    elif words[0] in VERBS:
         os.environ["COMP_LINE"] = " ".join(["gpe", *words[1:]])
         _run(words[0], ["--shell-completion", "query=bash"])
+
+
+def _words_without_hydra(verb: str, begun: str) -> list[str]:
+    """Return the words that a verb without Hydra may have: its keys, and shipped models where they stand alone or after ``checkpoint=``."""
+    from gpe_pl.learned.pretrained import names
+
+    keys = [f"{key}=" for key in importlib.import_module(f"gpe_pl.{VERBS[verb][0]}").KEYS]
+    of_models = [f"checkpoint={name}" for name in names()] if "checkpoint=" in keys else names() if verb in NAMED else []
+    return [word for word in (*of_models, *keys) if word.startswith(begun)]
 
 
 if __name__ == "__main__":

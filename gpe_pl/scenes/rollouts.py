@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
+
+import torch
 
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.training_ranges import stored_ranges
@@ -20,6 +23,20 @@ from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 QUICK = 200_000
 """Node-frames up to which a rollout takes seconds without compiled passes. Compiling them takes longer, once for each version of the package."""
+
+FEW = 2_000
+"""Number of nodes up to which PyTorch runs on one thread. Threads that share such small operations mostly wait for each other."""
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Run PyTorch's operations on one thread inside this block."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
 
 
 def middle_values(simulator: LearnedSimulator) -> dict[str, dict[str, float]]:
@@ -52,7 +69,8 @@ def predicted(simulator: LearnedSimulator, state: State, metadata: Metadata, num
     """
     start = simulator.standing(state, metadata)
     is_quick = num_frames * state.num_nodes <= QUICK and not has_compiled("nn/network_program_kernels.py")
-    with unfused() if is_quick else contextlib.nullcontext(), progress_bar(label) as on_progress:
+    on_threads = one_thread() if state.num_nodes <= FEW else contextlib.nullcontext()
+    with unfused() if is_quick else contextlib.nullcontext(), on_threads, progress_bar(label) as on_progress:
         return rollout(
             Contained(simulator, metadata.frame_dt),
             start,

@@ -39,12 +39,21 @@ def test_a_misspelt_verb_gets_the_one_that_was_meant(monkeypatch: pytest.MonkeyP
     assert capsys.readouterr().err.startswith("error: gpe 'dmeo': unknown verb; did you mean 'demo'?; verbs: ")
 
 
-@pytest.mark.parametrize(("line", "words"), [("gpe ", {"fit", "demo"}), ("gpe fit data=sn", {"data=snow", "data=snow_on_liquid"})])
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("gpe ", {"fit", "demo"}),
+        ("gpe fit data=sn", {"data=snow", "data=snow_on_liquid"}),
+        ("gpe demo s", {"sand", "snow", "seconds=", "seed="}),
+        ("gpe predict scene.yaml checkpoint=f", {"checkpoint=fem", "checkpoint=fluid"}),
+    ],
+)
 def test_words_complete(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], line: str, words: set[str]) -> None:
     monkeypatch.setenv("COMP_LINE", line)
-    if line == "gpe ":
+    if not line.startswith("gpe fit"):
         call(monkeypatch, "completion", "words")
-        assert words <= set(capsys.readouterr().out.split())
+        found = set(capsys.readouterr().out.split())
+        assert words <= found if line == "gpe " else words == found
     else:  # Hydra ends the process
         found = subprocess.run([sys.executable, "-m", "gpe_pl", "completion", "words"], capture_output=True, text=True, cwd=ROOT)
         assert set(found.stdout.split()) == words
@@ -88,7 +97,14 @@ def test_a_wheel_works_outside_the_clone(tmp_path: Path) -> None:
     subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", str(wheel)], check=True)
     (site / "dependencies.pth").write_text("\n".join(others))  # below the package of this environment, which a .pth file in it would name
     environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "DISPLAY", "WAYLAND_DISPLAY")}
-    for arguments in (["demo", "sand", "seconds=0.1"], ["info", "sand", "speed=false"], ["fit", "--help"]):
+    (tmp_path / "scene.yaml").write_text("box: [1.0, 1.0]\nbodies:\n  - {block: sand, at: [0.1, 0.0], size: [0.2, 0.1]}\n")
+    for arguments in (
+        ["demo", "sand", "seconds=0.1"],
+        ["info", "sand", "speed=false"],
+        ["predict", "scene.yaml", "seconds=0.1"],
+        ["play", "sand", "folder=page"],
+        ["fit", "--help"],
+    ):
         done = subprocess.run([python.with_name("gpe"), *arguments], capture_output=True, text=True, cwd=tmp_path, env=environment)
         assert done.returncode == 0, done.stderr
-    assert (tmp_path / "demo_sand.html").stat().st_size > 50_000
+    assert all((tmp_path / name).stat().st_size > 50_000 for name in ("demo_sand.html", "scene.html", "page/play.js"))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
 from gpe_pl.learned.pretrained import names
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.scenes import demo, info
+from gpe_pl.scenes import demo, info, rollouts
 from gpe_pl.scenes.film import FilmFault
 from gpe_pl.scenes.recorded import NotRecorded, recorded_scene, recorded_solver
 from gpe_pl.scenes.rollouts import middle_values
@@ -78,3 +80,23 @@ def test_info_says_settings_ranges_and_checks(capsys: pytest.CaptureFixture[str]
 def test_info_times_a_step(capsys: pytest.CaptureFixture[str]) -> None:
     info.run("sand", {})
     assert "ms for a frame of 320 nodes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("few", "threads"), [(10_000, 1), (0, 2)])
+def test_small_scenes_run_on_one_thread(monkeypatch: pytest.MonkeyPatch, few: int, threads: int) -> None:
+    simulator = LearnedSimulator.from_checkpoint("sand")
+    own, seen, before = simulator.builder.metadata, list[int](), torch.get_num_threads()
+    monkeypatch.setattr(rollouts, "FEW", few)
+    whole = rollouts.rollout
+
+    def watched(*arguments: Any) -> Any:
+        seen.append(torch.get_num_threads())
+        return whole(*arguments)
+
+    monkeypatch.setattr(rollouts, "rollout", watched)
+    torch.set_num_threads(2)
+    try:
+        rollouts.predicted(simulator, recorded_scene(own).sample(middle_values(simulator), 0), own, 2, "")
+        assert (seen, torch.get_num_threads()) == ([threads], 2)
+    finally:
+        torch.set_num_threads(before)
