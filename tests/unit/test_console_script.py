@@ -52,8 +52,8 @@ def test_words_complete(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     monkeypatch.setenv("COMP_LINE", line)
     if not line.startswith("gpe fit"):
         call(monkeypatch, "completion", "words")
-        found = set(capsys.readouterr().out.split())
-        assert words <= found if line == "gpe " else words == found
+        printed = set(capsys.readouterr().out.split())
+        assert words <= printed if line == "gpe " else words == printed
     else:  # Hydra ends the process
         found = subprocess.run([sys.executable, "-m", "gpe_pl", "completion", "words"], capture_output=True, text=True, cwd=ROOT)
         assert set(found.stdout.split()) == words
