@@ -24,6 +24,8 @@ from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 
 OF_BOUNDARY = ("pos", "vel", "normal", "friction", "restitution")
+UNUSED = ("cells", "rest_pos", "frame_velocity", "loads", "rigid_body", "node_id")
+"""Fields of states that features of joined scenes do not read. Some scenes may have them and others not."""
 
 
 def covers(topologies: Sequence[Topology], states: Sequence[State], spec: FeatureSpec) -> bool:
@@ -79,7 +81,8 @@ def joined_graph(compiled: CompiledGraph, topologies: Sequence[Topology], states
 
 def _joined_state(states: Sequence[State]) -> State:
     walls: dict[str, Any] = {name: torch.cat([getattr(s.boundary, name) for s in states]) for name in OF_BOUNDARY}
-    nodes = State.joined([replace(s, cells=None, rest_pos=None, frame_velocity=None, loads=None) for s in states])
+    unused: dict[str, Any] = dict.fromkeys(UNUSED)
+    nodes = State.joined([replace(s, **unused) for s in states])
     return replace(nodes, boundary=Boundary(**walls))
 
 

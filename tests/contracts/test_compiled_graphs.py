@@ -18,6 +18,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.compiled_graph import works_on
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
+from gpe_pl.rollout.loop import sound
 from gpe_pl.schema import node_code, param_names
 from gpe_pl.system.compiled import unfused
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
@@ -214,6 +215,14 @@ def test_scenes_with_walls_at_rest_and_moving_walls_are_joined() -> None:
     topologies = [build.topology(state) for state in states]
     expected = batched([build.graph(*pair) for pair in zip(topologies, states, strict=True)])
     scenes.assert_equal_graphs(build.batch(topologies, states), expected)
+
+
+def test_scenes_with_rigid_bodies_and_open_scenes_are_joined_with_others() -> None:
+    build, s = particles()
+    states = [s.to_torch(), replace(s, rigid_body=np.arange(s.num_nodes) // 30).to_torch(), s.opened(()).to_torch()]
+    found = [sound(after) for after in simulator(build, states[0]).step_all(states)]
+    torch.testing.assert_close(found[0].pos, found[2].pos, rtol=0, atol=1e-9)
+    assert float((found[0].pos - found[1].pos).abs().max()) > 1e-6  # bodies move as a whole
 
 
 @pytest.mark.parametrize("clamps", [True, False])
