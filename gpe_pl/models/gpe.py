@@ -329,11 +329,6 @@ class GPE(Model):
             readable.append(readers.union(*({r[0], r[2]} for r in self.spec.relations if {r[0], r[2]} & readers)))
         return readable[::-1]
 
-    def train(self, mode: bool = True) -> "GPE":
-        if mode:  # weights are about to change, perhaps in ways that PyTorch does not count
-            self._program = None
-        return super().train(mode)
-
     def forward(self, data: HeteroData) -> Prediction:
         """Return accelerations without gravity per material, in units of the data set's acceleration scale, and stresses.
 

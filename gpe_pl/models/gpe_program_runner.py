@@ -1,27 +1,31 @@
 """Runs a GPE as a network program: one compiled call per forward pass, on a CPU without gradients.
 
 ``GPE.forward`` does so in evaluation mode without gradients. ``system.compiled.unfused`` switches it off. PyTorch's operations take over, with a notice in
-the log, if a submodule has hooks, if the model is a subclass of ``GPE``, if the weights were made in inference mode, or if a graph has another precision,
+the log, if a layer has hooks or another ``forward``, if a layer or the model is of another class than ``GPE`` makes, or if a graph has another precision,
 device or shape than the weights.
 
-The program has a copy of the weights. It is written again when PyTorch's version counter of a weight changes, and after ``train()``. Writing through
-``weight.data`` or NumPy in evaluation mode does not change the counter: call ``model.train()`` and ``model.eval()`` afterwards.
+The program has a copy of the weights. It is written again when a layer is replaced or a weight changes. Each call compares a checksum of all weights, because
+PyTorch does not count changes through ``weight.data``, NumPy or another process.
 """
 
 from __future__ import annotations
 
 import logging
 from functools import lru_cache
-from operator import attrgetter, is_
+from operator import is_
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch_geometric.data import HeteroData
+from torch_geometric.nn.aggr import SumAggregation
 
 from gpe_pl.models.gpe_program import GPEProgram
+from gpe_pl.nn.blocks import MLP
+from gpe_pl.nn.momentum_conv import MomentumConv
 from gpe_pl.nn.network_program import Executable, Tables
+from gpe_pl.nn.pointers import checksum
 from gpe_pl.nn.stores import contents
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import is_symmetric
@@ -31,7 +35,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_changes = attrgetter("_version")
+COVERED = (nn.Linear, nn.PReLU, nn.LayerNorm, nn.ModuleDict, nn.ModuleList, MLP, MomentumConv, SumAggregation)
+"""Classes of layers that a program covers, beside those in ``models.gpe``. A program knows their equations, so subclasses are not covered."""
 
 
 class Decoded(NamedTuple):
@@ -63,14 +68,24 @@ class GPEProgramRunner:
 
     def __init__(self, model: GPE) -> None:
         modules = [*model.modules()]
+        layers = [
+            m for name, m in model.named_modules() if name.partition(".")[0] not in ("", "elastic_bodies")
+        ]  # the law is no part of the program
         self._hooks = [hooks for m in modules[1:] for hooks in (m._forward_hooks, m._forward_pre_hooks)]
+        self._attributes = [vars(m) for m in layers]
+        self._unknown = next(
+            (type(m).__name__ for m in layers if type(m) not in COVERED and type(m).__module__ != type(model).__module__), None
+        )
         parts = [
             (own, name, part) for m in modules for own in (m._modules, m._parameters) for name, part in own.items() if part is not None
         ]
         self._owners, self._names, self._parts = ([*column] for column in zip(*parts, strict=True))
         self._weights = [part for part in self._parts if isinstance(part, Tensor)]
-        self._are_tracked = not any(p.is_inference() for p in self._weights)
-        self._state = self._state_of_weights()
+        self._addresses = [*map(Tensor.data_ptr, self._weights)]
+        self._places, self._words = np.array(self._addresses, np.int64), np.array([*map(_num_words, self._weights)], np.int64)
+        self._checksum = checksum(self._places, self._words)
+        if self._unknown is not None:
+            return
         with torch.no_grad():
             written = GPEProgram(model)
         self.written, self.spec, self.dtype = written, model.spec, written.program.dtype
@@ -108,11 +123,11 @@ class GPEProgramRunner:
 
     def is_current(self) -> bool:
         """Tell whether the model still has the layers and weights with which the program was written."""
-        return all(map(is_, map(dict.get, self._owners, self._names), self._parts)) and self._state_of_weights() == self._state
-
-    def _state_of_weights(self) -> tuple[list[int], list[int]]:
-        """Return addresses of the weights and PyTorch's counts of their changes. Weights that were made in inference mode have no such count."""
-        return [*map(Tensor.data_ptr, self._weights)], [*map(_changes, self._weights)] if self._are_tracked else []
+        return (
+            all(map(is_, map(dict.get, self._owners, self._names), self._parts))
+            and [*map(Tensor.data_ptr, self._weights)] == self._addresses
+            and checksum(self._places, self._words) == self._checksum
+        )
 
     def __call__(self, data: HeteroData, skips: Skips, keep_absent: bool) -> Decoded | None:
         """Return what the network decodes from a graph with standardised features; None if the program cannot be used.
@@ -125,10 +140,12 @@ class GPEProgramRunner:
         Raises:
             IndexError: an edge names a node that does not exist.
         """
+        if self._unknown is not None:
+            return notice(f"a layer is a {self._unknown}, which GPE does not make")
         if any(self._hooks):
             return notice("a layer has hooks")
-        if not self._are_tracked:
-            return notice("the weights were made in inference mode, so that changes are not seen")
+        if any("forward" in own for own in self._attributes):
+            return notice("a layer has another forward")
         try:
             found = self._run(data, skips)
         except _UnexpectedError:
@@ -187,6 +204,12 @@ class GPEProgramRunner:
 
 class _UnexpectedError(Exception):
     """A tensor of another precision, device or shape than the weights."""
+
+
+def _num_words(weight: Tensor) -> int:
+    """Return the number of words of four bytes from the first to the last value of a tensor in memory."""
+    extent = 1 + sum((size - 1) * step for size, step in zip(weight.shape, weight.stride(), strict=True))
+    return extent * weight.element_size() // 4 if weight.numel() else 0
 
 
 def _table(rows: list[Any], columns: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import no_type_check
 
+import numpy as np
 from numba import carray, njit, types
 from numba.extending import intrinsic
 
@@ -32,3 +33,16 @@ def row_of(matrix, row, column, count):
     """Return some columns of a row. Loops over them vectorise, unlike loops over ``matrix[row, column + c]``, whose index might be negative."""
     address = matrix.ctypes.data + matrix.itemsize * (row * matrix.shape[1] + column)
     return carray(pointer(address), (count,), matrix.dtype)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def checksum(addresses, num_words):
+    """Return a checksum of the words of four bytes at some addresses, ``num_words`` at each. A change of one word always changes it, others nearly always."""
+    total = np.uint32(0)
+    for k in range(len(addresses)):
+        words, part = carray(pointer(addresses[k]), num_words[k], np.uint32), np.uint32(0)
+        for c in range(num_words[k]):
+            part = np.uint32(part + words[c] * np.uint32(2 * c + 1))  # an odd factor has an inverse
+        total = np.uint32(total * np.uint32(2_654_435_761) + part)
+    return total

@@ -19,6 +19,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models import gpe_program_runner
 from gpe_pl.models.base import Prediction
 from gpe_pl.models.gpe import GPE
+from gpe_pl.nn.blocks import MLP
 from gpe_pl.nn.fused import unfused
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.training.optimizer import OnePassAdam
@@ -243,7 +244,6 @@ def test_changed_weights_are_read_again() -> None:
 
 
 def test_weights_are_read_again_after_training() -> None:
-    """Compiled passes over parameters write to memory, which PyTorch does not see by itself."""
     model, data = build(scenes.builder().spec, island_momentum="ignored"), scenes.graph()
     before = compiled(model, data).acceleration["sand"]
     optimizer = OnePassAdam(model.parameters(), 0.01)
@@ -251,11 +251,30 @@ def test_weights_are_read_again_after_training() -> None:
     optimizer.step()
     assert not torch.equal(compiled(model, data).acceleration["sand"], before)
     assert_equal(model, data)
-    model.train()
-    for parameter in model.parameters():
-        parameter.data *= 1.01  # not seen, as in averages of weights
-    model.eval()
-    assert_equal(model, data)
+
+
+def test_changes_that_pytorch_does_not_count_are_seen() -> None:
+    """Averages of weights, NumPy, and vectors that contain all weights write to memory in evaluation mode."""
+    model, data = build(scenes.builder().spec), scenes.graph()
+    weight = model.updates[0]["sand"][0].weight  # type: ignore[index]
+    vector = torch.nn.utils.parameters_to_vector(model.parameters()).detach()
+
+    def through_data() -> None:
+        for parameter in model.parameters():
+            parameter.data *= 1.01
+
+    def through_numpy() -> None:
+        weight.detach().numpy()[3, 5] += 1.0
+
+    def through_a_vector() -> None:
+        vector.mul_(1.01)
+
+    torch.nn.utils.vector_to_parameters(vector, model.parameters())
+    for change in (through_a_vector, through_data, through_numpy):
+        before = compiled(model, data).acceleration["sand"]
+        change()
+        assert not torch.equal(compiled(model, data).acceleration["sand"], before)
+        assert_equal(model, data)
 
 
 def notices(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -266,7 +285,14 @@ class Changed(GPE):
     """A model of someone else."""
 
 
-def test_subclasses_and_weights_of_inference_mode_give_way_with_a_notice(caplog: pytest.LogCaptureFixture) -> None:
+class Doubled(MLP):
+    """A layer of someone else."""
+
+    def forward(self, *rows: Any) -> Tensor:
+        return 2 * super().forward(*rows)
+
+
+def test_subclasses_and_layers_of_someone_else_give_way_with_a_notice(caplog: pytest.LogCaptureFixture) -> None:
     data, spec = scenes.graph(), scenes.builder().spec
     gpe_program_runner.notice.cache_clear()
     with torch.inference_mode(), caplog.at_level(logging.INFO):
@@ -277,7 +303,18 @@ def test_subclasses_and_weights_of_inference_mode_give_way_with_a_notice(caplog:
             expected = made(data).acceleration["sand"]
         for model in (made, changed, made, changed):
             torch.testing.assert_close(model(data).acceleration["sand"], expected, rtol=0, atol=1e-10)
-    assert notices(caplog) == ["the weights were made in inference mode, so that changes are not seen", "Changed is a subclass of GPE"]
+        decoder: Any = made.node_decoder["sand"]
+        made.node_decoder["sand"] = Doubled(8, 8, spec.dim).double()
+        made.node_decoder["sand"].load_state_dict(decoder.state_dict())
+        torch.testing.assert_close(made(data).acceleration["sand"], 2 * expected, rtol=0, atol=1e-10)
+        made.node_decoder["sand"] = decoder
+        torch.testing.assert_close(made(data).acceleration["sand"], expected, rtol=0, atol=1e-10)
+        decoder.forward = lambda rows: rows[:, : spec.dim]
+        found = made(data).acceleration["sand"]
+        with unfused():
+            torch.testing.assert_close(found, made(data).acceleration["sand"], rtol=0, atol=1e-10)
+    wanted = ["Changed is a subclass of GPE", "a layer is a Doubled, which GPE does not make", "a layer has another forward"]
+    assert notices(caplog) == wanted
 
 
 def test_where_it_gives_way(caplog: pytest.LogCaptureFixture) -> None:
