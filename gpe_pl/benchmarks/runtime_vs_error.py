@@ -80,7 +80,7 @@ class Settings:
         checkpoints: further models: files, or names of shipped models; each takes part in the case of its data set. Their training time is not known.
         tuning: folders of further runs that were trained to choose settings; the break-even counts their training.
         split, num_trajectories: split and number of the scenes.
-        horizons: numbers of frames over which errors are averaged; the full length is always added.
+        horizons: numbers of frames over which errors are averaged, below the full length, which is always added.
         num_threads: threads of PyTorch; the solvers use one.
         accelerator: device of the models; the solvers run on the CPU.
     """
@@ -276,7 +276,7 @@ def _scene(
             seconds = fraction * seconds_of[_nodes(spec)] + (1 - fraction) * seconds
         seconds_of[name] = seconds
         error = squared_error(prediction, truth)[1:]
-        mse = {str(h): float(np.mean(error[:h])) for h in settings.horizons if h <= len(error)} | {"full": float(np.mean(error))}
+        mse = {str(h): float(np.mean(error[:h])) for h in settings.horizons if h < len(error)} | {"full": float(np.mean(error))}
         yield {
             "simulator": name,
             "family": family,

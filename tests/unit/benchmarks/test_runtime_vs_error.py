@@ -128,7 +128,7 @@ def untrained(stride: int = 1) -> LearnedSimulator:
 
 def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
-    settings = Settings({}, [], factors=[2.0], step_factors=[2], num_trajectories=1, horizons=[10])
+    settings = Settings({}, [], factors=[2.0], step_factors=[2], num_trajectories=1, horizons=[10, 21, 40])  # a rollout has 21 frames
     found = compare(spec, {"GPE 1 × 8": Entrant(untrained(), Spent(60.0, (Simulated(1, 150.0, 10.0),)))}, settings)
     by_name = {p.name: p for p in found.points}
     assert {DATA, "GPE 1 × 8", "ballistic", "stops at walls", "constant velocity"} < set(by_name)
