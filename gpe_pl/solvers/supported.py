@@ -27,6 +27,8 @@ def check_surroundings(state: State, solver: str, computes_open_scenes: bool = F
         raise SimulationError(f"{solver} does not compute scenes with inlets and outlets; FLIP and MPM do", reason="input")
     if state.loads is not None:
         raise SimulationError(f"{solver} computes neither prescribed nodes nor nodal forces; the scene has some", reason="input")
+    if state.rigid_body is not None and np.any(np.asarray(state.rigid_body) >= 0):
+        raise SimulationError(f"{solver} does not compute rigid bodies; the scene has some", reason="input")
     b = state.boundary
     if _moves(b) or np.any(np.asarray(b.restitution) != 0):
         raise SimulationError(f"{solver} supports only boundaries at rest and without restitution", reason="input")

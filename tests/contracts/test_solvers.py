@@ -184,6 +184,7 @@ SURROUNDINGS = {
         s, periodicity=Periodicity(((0.0, 1.0),) * s.dim, (True, *(False,) * (s.dim - 1)))
     ),
     "supports only boundaries at rest": lambda s: replace(s, boundary=replace(moving_later(s.boundary), shapes=s.boundary.shapes)),
+    "does not compute rigid bodies": lambda s: replace(s, rigid_body=np.arange(s.num_nodes) % 2 - 1),
     "takes walls and obstacles from the shapes of the boundary": lambda s: replace(s, boundary=replace(s.boundary, shapes=())),
 }
 
