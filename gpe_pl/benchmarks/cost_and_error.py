@@ -144,6 +144,4 @@ def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: f
     It is infinite if training never pays off, 0 if no solver has so small an error, and NaN if the training time is not known.
     """
     saved = (cost_at_error(solvers, point.error(horizon), horizon) - point.cost) * duration
-    if saved <= 0:
-        return float("inf")
-    return 0.0 if np.isinf(saved) else point.overhead / saved
+    return float("inf") if saved <= 0 else point.overhead / saved  # of an infinite saving 0

@@ -110,6 +110,9 @@ def test_training_pays_off_after_what_it_saves() -> None:
     assert break_even(model, LADDER, "full", duration=2.0) == pytest.approx(300.0)
     model.seconds = [3.0]
     assert break_even(model, LADDER, "full", duration=2.0) == float("inf")
+    for overhead, expected in ((60.0, 0.0), (float("nan"), float("nan"))):  # no solver is as accurate
+        exact = replace(point("exact", 9.0, 1e-9, "learned"), overhead=overhead)
+        assert break_even(exact, LADDER, "full", duration=2.0) == pytest.approx(expected, nan_ok=True)
 
 
 def test_hypervolume_is_the_area_of_steps() -> None:
