@@ -33,7 +33,7 @@ README = DOCS.parent / "README.md"
 BLOCK = re.compile(r"(<!-- begin (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 LIST = re.compile(r"(<!-- begin list -->\n).*?(<!-- end list -->)", re.DOTALL)
 FILES = (
-    *("table.md", "strides.md", "table.csv", "config.json", "results.json", "step_times.json", "forward_times.json"),
+    *("table.md", "strides.md", "scales.md", "table.csv", "config.json", "results.json", "step_times.json", "forward_times.json"),
     *("table1.md", "table1_ratios.md", "table1.csv"),
     *("trials.md", "trials.csv", "showcase.json", "showcase.md"),
 )

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from gpe_pl.config.entry_point import LARGEST_INTEGER, ConfigError, compose, construct, construct_target
-from gpe_pl.files.names import data_name
+from gpe_pl.files.names import data_name, spacing_suffix
 from gpe_pl.schema import SPLITS
 
 if TYPE_CHECKING:
@@ -30,6 +33,21 @@ TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "boun
 """Keys of ``data`` that only hold values for other keys, such as one for each size or dimension."""
 STRIDE = "stride"
 """Key of ``data`` with the number of stored frames in a frame of a model. It selects frames when data are read; stored data do not depend on it."""
+SPACING, SCALES = "spacing_factor", "scales"
+"""Keys of ``data`` with the factor on the spacing of nodes, which other keys contain, and with the scales of a training (``ScaleGrid``)."""
+
+
+@dataclass(frozen=True)
+class ScaleGrid:
+    """Spacings and frame intervals of a training. The training data have all pairs of them.
+
+    Attributes:
+        spacing_factors: values of ``data.spacing_factor``.
+        strides: values of ``data.stride``.
+    """
+
+    spacing_factors: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
+    strides: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]
 
 
 def stride_of(cfg: DictConfig) -> int:
@@ -61,7 +79,7 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
     values: dict[str, Any] = OmegaConf.to_container(cfg.data, resolve=True)  # type: ignore[assignment]
-    for key in (*TABLES, STRIDE):
+    for key in (*TABLES, STRIDE, SPACING, SCALES):
         values.pop(key, None)
     scene = construct_target(values.pop("scene"), "data.scene", "gpe_pl.solvers.")
     solver = construct_target(values.pop("solver"), "data.solver", "gpe_pl.solvers.")
@@ -155,8 +173,46 @@ def evaluated_config(cfg: DictConfig) -> DictConfig:
     """Return the config with ``data`` as the evaluation needs it: that of the training, with the keys of ``evaluation.data`` replaced."""
     from omegaconf import OmegaConf
 
-    merged: Any = OmegaConf.merge(cfg, {"data": cfg.evaluation.data or {}})
+    given: Any = cfg.evaluation.data or {}
+    merged: Any = OmegaConf.merge(cfg, _spaced(cfg, given[SPACING]) if SPACING in given else {}, {"data": given})
     return merged
+
+
+def _spaced(cfg: DictConfig, factor: float | int) -> dict[str, Any]:
+    """Return what a resolved config replaces for another ``data.spacing_factor``: the settings in ``conf`` that contain it.
+
+    Raises:
+        ConfigError: the data have no such factor.
+    """
+    if SPACING not in cfg.data:
+        raise ConfigError(
+            f"spacing_factor={factor:g}: data={cfg.data.name} has none; choose data of bodies of particles, such as data=sand"
+        )
+    before = cfg.data[SPACING]
+    if factor == before:
+        return {}
+    grid = {"grid_spacing": factor * (cfg.data.scene.grid_spacing / before)}
+    name = cfg.data.name.removesuffix(spacing_suffix(before)) + spacing_suffix(factor)
+    return {"data": {SPACING: factor, "name": name, "scene": grid, "solver": grid}}
+
+
+def training_parts(cfg: DictConfig) -> list[DictConfig]:
+    """Return the config of each pair of spacing and stride in ``data.scales``; without it, the config itself.
+
+    Raises:
+        ConfigError: ``data.scales`` is not valid, or other settings allow one scale only.
+    """
+    from omegaconf import OmegaConf
+
+    if (given := cfg.data.get(SCALES)) is None:
+        return [cfg]
+    scales = construct(ScaleGrid, given, "data.scales")
+    if cfg.graph.scales == "one":
+        raise ConfigError("data.scales: the model has to take several scales; set graph.scales=dimensionless")
+    if (cfg.training.unroll_steps or 1) > 1 or cfg.training.targets != "trajectory":
+        raise ConfigError("data.scales: works with training.targets=trajectory and training.unroll_steps=null only")
+    spaced = [OmegaConf.merge(cfg, _spaced(cfg, factor)) for factor in scales.spacing_factors]
+    return [OmegaConf.merge(own, {"data": {STRIDE: stride, SCALES: None}}) for own in spaced for stride in scales.strides]  # type: ignore[misc]
 
 
 def check_same_frames(trained: Metadata, evaluated: Metadata) -> None:

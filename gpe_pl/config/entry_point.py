@@ -36,13 +36,13 @@ from gpe_pl.config.typed_keys import without_effect
 from gpe_pl.errors import GpeError
 from gpe_pl.errors.printable import clean_messages, did_you_mean, one_line, speak_utf8
 from gpe_pl.files.atomic import replace_text, unnamed
-from gpe_pl.files.names import NameRefused, run_name, sweep_name
+from gpe_pl.files.names import NameRefused, run_name, spacing_suffix, sweep_name
 from gpe_pl.files.run_folder import refuse_links
 from gpe_pl.learned.pretrained import model_name
 from gpe_pl.system import early_interrupts
 from gpe_pl.system.signatures import checked, parameters
 
-WITHOUT_KEY = {"adaptation", "comparison", "experiment", "law", "parameters", "recipe", "scene", "solver", "tuned"}
+WITHOUT_KEY = {"adaptation", "comparison", "experiment", "law", "parameters", "recipe", "scaling", "scene", "solver", "tuned"}
 """Config groups that set keys under other names than their own. A command may have a key of its own by such a name, as convert has ``parameters``."""
 
 plugins.register()  # files in conf/ use the plugins
@@ -52,6 +52,7 @@ OmegaConf.register_new_resolver("model_name", model_name, replace=True)  # ${mod
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # ${run_name:name} in conf/ checks the name of a results folder
 OmegaConf.register_new_resolver("sweep_name", sweep_name, replace=True)
 OmegaConf.register_new_resolver("fine_suffix", lambda fine: "" if fine == 1 else f"_fine{fine}", replace=True)  # of names of data sets
+OmegaConf.register_new_resolver("spacing_suffix", spacing_suffix, replace=True)
 
 T = TypeVar("T")
 

@@ -21,6 +21,7 @@ from gpe_pl.config.datasets import (
     material_controls,
     scene_metadata,
     stride_of,
+    training_parts,
 )
 from gpe_pl.config.entry_point import ConfigError, bind, construct
 from gpe_pl.data.checksum import split_checksum
@@ -84,7 +85,8 @@ class FitRun:
         check_splits(evaluated_config(cfg), self.evaluation.splits, "evaluation.splits")
         check_material_controls(cfg, self.evaluation)
         self.graph = construct(GraphConfig, cfg.graph, "graph")
-        self.stride, self.evaluated_stride = stride_of(cfg), stride_of(evaluated_config(cfg))
+        self.parts = training_parts(cfg)
+        self.stride, self.evaluated_stride = stride_of(self.parts[0]), stride_of(evaluated_config(cfg))
         if (self.training.unroll_steps or 1) > 1 and self.graph.cells:
             raise ConfigError(
                 f"training.unroll_steps={self.training.unroll_steps}: not together with graph.cells=true, whose contacts have no "
@@ -110,7 +112,7 @@ class FitRun:
             StartError: ``evaluation.start_time`` leaves too little history, or is between frames.
             ConfigError: evaluated data have frames of another length.
         """
-        scenes, evaluated = scene_metadata(self.cfg, "train"), evaluated_config(self.cfg)
+        scenes, evaluated = scene_metadata(self.parts[0], "train"), evaluated_config(self.cfg)
         self.training.noise.check(scenes)
         if self.start is not None:
             builder = GraphBuilder(self.graph, scenes)
@@ -118,11 +120,14 @@ class FitRun:
             stride = self.start.stride_on(scene_metadata(self.cfg, "train", strided=False))
             if stride and stride != self.stride:
                 log.warning("start_from: data.stride=%d has frames as long as those of the trained model", stride)
-        self.first_frame = self.evaluation.first_frame(self.graph.history, scenes.frame_dt)
-        if self.cfg.evaluation.data:
-            check_same_frames(scenes, scene_metadata(evaluated, self.evaluation.splits[0]))
-        self.root = ensure_data(self.cfg)
-        self.evaluated_root = ensure_data(evaluated) if self.cfg.evaluation.data else self.root
+        rolled_out = scene_metadata(evaluated, self.evaluation.splits[0])
+        self.first_frame = self.evaluation.first_frame(self.graph.history, rolled_out.frame_dt)
+        if self.cfg.evaluation.data and self.graph.scales == "one":
+            check_same_frames(scenes, rolled_out)
+        self.root, *others = (ensure_data(part) for part in self.parts)
+        self.others = list(zip(others, map(stride_of, self.parts[1:]), strict=True))
+        is_same = not self.cfg.evaluation.data and len(self.parts) == 1
+        self.evaluated_root = self.root if is_same else ensure_data(evaluated)
         self.controls = material_controls(self.cfg, self.evaluation, self.evaluated_root, self.first_frame)
         self.device = set_up(self.trainer)
 
@@ -201,7 +206,9 @@ class FitRun:
 
     @cached_property
     def _checksums(self) -> dict[str, str]:
-        return {split: split_checksum(self.root, split) for split in ("train", "val")}
+        own = {split: split_checksum(self.root, split) for split in ("train", "val")}
+        further = {f"{split} {k}": split_checksum(root, split) for k, (root, _) in enumerate(self.others, 1) for split in own}
+        return own | further
 
     @property
     def _trained(self) -> dict[str, Any]:
@@ -236,6 +243,7 @@ class FitRun:
             augmentation=self.training.augmentation,
             stride=self.stride,
             unroll_steps=self.training.unroll_steps or 1,
+            others=self.others,
         )
 
     @property
@@ -259,7 +267,7 @@ class FitRun:
         data = self._data
         simulator = LearnedSimulator(self.new_model(spec=data.builder.spec), data.builder, data.stride)
         sample = data.statistics_sample()
-        simulator.fit_statistics(sample, data.parameter_ranges(), data.trained_scene())
+        simulator.fit_statistics(sample, data.parameter_ranges(), data.trained_scene(), data.trained_scales())
         neighbors = mean_num_neighbors(sample, data.builder.spec.materials) if training.neighbor_weight is not None else 1.0
         if self.start is not None:
             new = simulator.start_from(self.start).new

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -18,6 +19,7 @@ from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.dataset import (
     CachedGraphs,
+    Scale,
     StoredTrajectory,
     WindowDataset,
     collated,
@@ -35,12 +37,13 @@ from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.standardizer import StatisticsSample
+from gpe_pl.learned.training_ranges import scale_range
 from gpe_pl.rollout.loop import Restartable
 from gpe_pl.schema import BOUNDARY, NODE_TYPES, EdgeType, grid, node_code, role
 from gpe_pl.system import ranks
 from gpe_pl.trajectory.scene_ranges import scene_range, united
 from gpe_pl.trajectory.store import StoreError
-from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 NUM_VAL_GRAPHS = 8
 """Number of graphs in a validation batch, unless ``BatchSize.max_nodes`` limits it. The validation error does not depend on it: the error is a quotient of sums
@@ -77,6 +80,68 @@ def data_statistics(root: Path | str) -> dict[str, float]:
         raise StoreError(f"{path}: holds no statistics; generate or import the data again") from None
 
 
+@dataclass(frozen=True)
+class _Part:
+    """A data set at one stride.
+
+    Attributes:
+        root: folder of the data set.
+        stride: number of stored frames in a frame of the model.
+        metadata: metadata of the longer frames, with the connectivity radius that they need.
+        acceleration_std: rms acceleration of the train split [m/s²].
+        train, val: views of the trajectories.
+    """
+
+    root: Path
+    stride: int
+    metadata: Metadata
+    acceleration_std: float
+    train: list[StoredTrajectory]
+    val: list[StoredTrajectory]
+
+    @classmethod
+    def opened(cls, root: Path, stride: int, history: int) -> _Part:
+        std = data_statistics(root)["acceleration_std"]
+        stored = open_split(root, "train")
+        train = usable(stored, stride)
+        val = every(usable(open_split(root, "val"), stride), stride)
+        metadata = train[0].window(0, 1).metadata
+        if stride > 1:
+            window_counts(every(train, stride), history)
+            statistics = stride_statistics(root, stride, train)
+            std, radius = statistics.acceleration_std, connectivity_radius(metadata, stride, statistics.max_speed)
+            metadata = replace(metadata.every(stride), connectivity_radius=radius)
+            train = every(train, stride, phases=stride)
+        elif len(train) < len(stored):
+            std = acceleration_std(t.window(0, t.num_frames) for t in train)
+        return cls(root, stride, metadata, std, train, val)
+
+    @property
+    def scale(self) -> Scale:
+        return self.metadata.spacing, self.metadata.frame_dt
+
+    @property
+    def velocity_unit(self) -> float:
+        """Rms acceleration × frame interval [m/s]."""
+        return self.acceleration_std * self.metadata.frame_dt
+
+
+def _common(parts: Sequence[_Part]) -> Metadata:
+    """Return the metadata of the first part with the largest connectivity radius in spacings of all.
+
+    Raises:
+        StoreError: a part has another dimension, other materials or parameters.
+    """
+    first = parts[0].metadata
+    for part in parts[1:]:
+        if (part.metadata.dim, part.metadata.materials, part.metadata.param_names) != (first.dim, first.materials, first.param_names):
+            raise StoreError(
+                f"{part.root}: has another dimension, other materials or parameters than {parts[0].root}; choose data of one kind"
+            )
+    spacings = max(part.metadata.connectivity_radius / part.metadata.spacing for part in parts)
+    return first if len(parts) == 1 else replace(first, connectivity_radius=spacings * first.spacing)
+
+
 class TrajectoryDataModule(L.LightningDataModule):
     """Training windows in an endless, seeded order that can be resumed, and a fixed sample of validation windows without noise.
 
@@ -95,6 +160,8 @@ class TrajectoryDataModule(L.LightningDataModule):
         augmentation: images of training windows.
         stride: number of stored frames in a frame of the model. Training windows begin at any stored frame, validation windows at every ``stride``-th.
         unroll_steps: number of steps of an unroll with gradients; see ``WindowDataset``.
+        others: folders of further data sets, each with a stride. They may have another spacing and frame interval if ``graph.scales`` allows it. The metadata
+            are those of the first, but the connectivity radius is the largest one in spacings.
 
     Attributes:
         push_forward: settings of the push-forward trick; None if it is not used. In steps with push-forward, batches contain starts of unrolls instead of
@@ -103,8 +170,8 @@ class TrajectoryDataModule(L.LightningDataModule):
     Raises:
         AugmentationError: the scenes do not have a symmetry of ``augmentation``.
         OpenScenesError: the scenes are open, and a setting needs nodes that stay.
-        StoreError: a split or its statistics are missing or damaged, too many of its trajectories cannot be used, none is long enough for a window, or a node
-            may move by half a period within a frame of this stride.
+        StoreError: a split or its statistics are missing or damaged, too many of its trajectories cannot be used, none is long enough for a window, a node
+            may move by half a period within a frame of this stride, or data sets differ in more than their scales.
         NoiseError: the noise is too large for the spacing of the data.
     """
 
@@ -124,29 +191,22 @@ class TrajectoryDataModule(L.LightningDataModule):
         augmentation: Augmentation = Augmentation(),  # noqa: B008
         stride: int = 1,
         unroll_steps: int = 1,
+        others: Sequence[tuple[Path, int]] = (),
     ) -> None:
         super().__init__()
         self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
         self.num_workers, self.num_val_windows = num_workers, num_val_windows
         self.num_statistics_windows, self.stride = num_statistics_windows, stride
         self.push_forward: PushForward | None = None
-        std = data_statistics(root)["acceleration_std"]
-        stored = open_split(root, "train")
-        train = usable(stored, stride)
-        val = every(usable(open_split(root, "val"), stride), stride)
-        self.metadata = train[0].window(0, 1).metadata
-        if stride > 1:
-            window_counts(every(train, stride), graph.history)
-            statistics = stride_statistics(root, stride, train)
-            std, radius = statistics.acceleration_std, connectivity_radius(self.metadata, stride, statistics.max_speed)
-            self.metadata = replace(self.metadata.every(stride), connectivity_radius=radius)
-            train = every(train, stride, phases=stride)
-        elif len(train) < len(stored):
-            std = acceleration_std(t.window(0, t.num_frames) for t in train)
+        self.parts = [_Part.opened(Path(folder), own, graph.history) for folder, own in ((root, stride), *others)]
+        self.metadata = _common(self.parts)
         self.builder = GraphBuilder(graph, self.metadata)
-        unit = std * self.metadata.frame_dt
-        noise.check(self.metadata, unit)
+        for part in self.parts:
+            noise.check(part.metadata, part.velocity_unit)
+        unit = self.parts[0].velocity_unit
+        train, val = ([stored for part in self.parts for stored in getattr(part, split)] for split in ("train", "val"))
         self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress, solver, augmentation, unroll_steps)
+        self.train_set.velocity_units = {part.scale: part.velocity_unit for part in self.parts}
         self.val_set = WindowDataset(val, self.builder, stress=stress)
         if sampling == "activity":
             self.train_set.probability = probabilities(self.train_set.activity())
@@ -225,9 +285,18 @@ class TrajectoryDataModule(L.LightningDataModule):
         """Return the range [2, channel] of gravity and boundary nodes over all training trajectories; see ``trajectory.scene_ranges``."""
         return united(map(_scene, self.train_set.trajectories))
 
+    def trained_scales(self) -> torch.Tensor:
+        """Return the range of spacings and frame intervals; see ``training_ranges.scale_range``."""
+        return scale_range([part.metadata for part in self.parts])
+
     def val_trajectories(self, count: int) -> list[Trajectory]:
-        """Read the first ``count`` trajectories of the ``val`` split that are valid and long enough; see ``long_enough``."""
-        return list(islice(long_enough(self.root, "val", self.builder.config.history, self.stride), count))
+        """Read the first ``count`` trajectories of the ``val`` split that are valid and long enough; see ``long_enough``.
+
+        Of several data sets, each gives the same number, and at least one.
+        """
+        own = -(-count // len(self.parts))
+        history = self.builder.config.history
+        return [t for part in self.parts for t in islice(long_enough(part.root, "val", history, part.stride), own)]
 
     def train_dataloader(self) -> DataLoader:
         trainer = self.trainer

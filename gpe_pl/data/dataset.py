@@ -6,7 +6,7 @@ A sample depends only on split, seed and sample number. Runs therefore resume ex
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -70,6 +70,9 @@ class UnrollKey:
 Key = int | tuple[int, int] | StartKey | UnrollKey
 """Key of a sample: the number of a window; sample number and window; or the key of a push-forward sample or of an unroll with gradients."""
 
+Scale = tuple[float, float]
+"""Rest spacing [m] and frame interval [s] of a scene."""
+
 CACHE_BYTES = 2 * 1024**3
 """A split is cached in memory if its compressed files have at most half this size [bytes]. Larger splits are read from disk window by window. Cached graphs may
 take this much memory, too."""
@@ -125,6 +128,12 @@ class StoredTrajectory:
     def whole(self) -> Trajectory:
         """Return all stored frames. Their digest is verified, either now or when they were cached. Errors are those of ``window``."""
         return read_trajectory(self.path, self.name, verify=True) if self.cached is None else self.cached
+
+
+def scale_of(stored: StoredTrajectory) -> Scale:
+    """Return the rest spacing and frame interval of a trajectory."""
+    metadata = stored.window(0, 1).metadata
+    return metadata.spacing, metadata.frame_dt
 
 
 def every(trajectories: Sequence[StoredTrajectory], stride: int, phases: int = 1) -> list[StoredTrajectory]:
@@ -334,6 +343,8 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         probability: probability of drawing each window [window], or None if all are equal. With it, graphs have a ``weight``: the uniform probability
             divided by this one.
         is_open: whether nodes enter and leave in any trajectory. Graphs then have a mask ``without_target`` [node] of nodes from which nothing is learned.
+        scales: scale of each trajectory; empty unless ``builder.config.scales`` allows several.
+        velocity_units: ``velocity_unit`` of scales that have their own.
 
     Raises:
         AugmentationError: the scenes do not have a symmetry of ``augmentation``.
@@ -363,6 +374,9 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         self.probability: np.ndarray | None = None
         self.ends = np.cumsum(window_counts(trajectories, builder.config.history, unroll_steps))
         self._num_phases = 1 + max(t.phase for t in trajectories)
+        self.scales = [] if builder.config.scales == "one" else [scale_of(stored) for stored in trajectories]
+        self.velocity_units: Mapping[Scale, float] = {}
+        self._builders = {scale: builder.at(*scale) for scale in self.scales}
 
     def __len__(self) -> int:
         return int(self.ends[-1])
@@ -376,6 +390,10 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
     def num_nodes(self, window: int) -> int:
         """Number of dynamic nodes in a window, without boundary nodes and virtual nodes."""
         return self.trajectories[self.locate(window)[0]].num_nodes
+
+    def scale(self, window: int) -> Scale | None:
+        """Scale of a window; None if the data have only one."""
+        return self.scales[self.locate(window)[0]] if self.scales else None
 
     def activity(self) -> np.ndarray:
         """Return the root mean square acceleration without gravity of each window [window] in m/s². This reads the whole split."""
@@ -413,7 +431,9 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         is_unroll = isinstance(key, UnrollKey)
         sample, window = (key.sample, key.window) if isinstance(key, UnrollKey) else (key, key) if isinstance(key, int) else key[:2]
         number, frame = self.locate(window)
-        history = self.builder.config.history
+        scale = self.scales[number] if self.scales else None
+        builder = self.builder if scale is None else self._builders[scale]
+        history = builder.config.history
         stored = self.trajectories[number]
         ahead = self.unroll_steps - 1 if is_unroll else 0 if start is None else min(start.num_steps, stored.num_frames - 2 - frame)
         original = stored.window(frame - history, frame + 2 + ahead)
@@ -424,7 +444,8 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         pos, is_given = truth[: history + 2], ~trajectory.is_predicted | carried(trajectory.openings, truth[history])
         if self.noise is not None:
             rng = np.random.default_rng((self.seed, sample))
-            pos = self.noise.apply(pos, self.builder.metadata.longest_side, self.velocity_unit, dt, rng)
+            unit = self.velocity_unit if scale is None else self.velocity_units.get(scale, self.velocity_unit)
+            pos = self.noise.apply(pos, builder.metadata.longest_side, unit, dt, rng)
             if is_given.any():  # their motion is given exactly
                 pos = np.where(is_given[:, None], truth[: history + 2], pos)
         velocities = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
@@ -478,13 +499,14 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
                 key.lane,
                 targets,
                 None if alive is None else torch.from_numpy(alive[history:].copy()),
+                scale,
             )
-            return unroll if start else unroll.graph(self.builder, state, 0)
+            return unroll if start else unroll.graph(builder, state, 0)
         target = (integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity)[rows]
         unknown = (
             None if alive is None else torch.from_numpy(~alive[history + 1][rows] | carried(trajectory.openings, truth[history][rows]))
         )
-        graph = training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[0], about, unknown)
+        graph = training_graph(builder, state, torch.from_numpy(target), None if stress is None else stress[0], about, unknown)
         if not is_unroll:
             return graph
         kept = 0.0 if self.noise is None else 1 - self.noise.correction  # fraction of the noise on the position that a step keeps

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 from torch.utils.data import Sampler
 
-from gpe_pl.data.dataset import Key, StartKey, UnrollKey, WindowDataset
+from gpe_pl.data.dataset import Key, Scale, StartKey, UnrollKey, WindowDataset
 from gpe_pl.system import ranks
 from gpe_pl.trajectory.store import StoreError
 
@@ -118,6 +118,8 @@ class BatchSize:
     def batches(self, data: WindowDataset, seed: int, step: int) -> Iterator[list[tuple[int, int]]]:
         """Yield the samples of each optimiser step as (sample number, window), from ``step`` on, without end."""
         if self.max_nodes is None:
+            if data.scales:
+                yield from islice(self._of_one_scale(data, iter(StepSampler(len(data), seed, probability=data.probability))), step, None)
             samples = iter(StepSampler(len(data), seed, lambda: step * self.num_graphs, data.probability))
             while True:
                 yield list(islice(samples, self.num_graphs))
@@ -131,6 +133,15 @@ class BatchSize:
         if self.max_nodes is None:
             return [windows[k : k + self.num_graphs] for k in range(0, len(windows), self.num_graphs)]
         return [[window for _, window in batch] for batch in self._packed(data, enumerate(windows), self.max_nodes)]
+
+    def _of_one_scale(self, data: WindowDataset, samples: Iterator[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
+        """Yield batches of samples that have the same spacing and frame interval, so that they can be unrolled together."""
+        waiting: dict[Scale | None, list[tuple[int, int]]] = {}
+        for sample in samples:
+            own = waiting.setdefault(data.scale(sample[1]), [])
+            own.append(sample)
+            if len(own) == self.num_graphs:
+                yield waiting.pop(data.scale(sample[1]))
 
     @staticmethod
     def _packed(data: WindowDataset, samples: Iterator[tuple[int, int]], max_nodes: int) -> Iterator[list[tuple[int, int]]]:
@@ -155,13 +166,15 @@ class BatchSampler(Sampler[list[Key]]):
         push_forward: settings of the push-forward trick, or None.
 
     Raises:
-        StoreError: batches may have fewer samples than there are ranks.
+        StoreError: batches may have fewer samples than there are ranks, or have a number of nodes although the data have several scales.
     """
 
     def __init__(
         self, data: WindowDataset, size: BatchSize, seed: int, step: Callable[[], int], push_forward: PushForward | None = None
     ) -> None:
         self.data, self.size, self.seed, self.step, self.push_forward = data, size, seed, step, push_forward
+        if data.scales and size.max_nodes is not None:
+            raise StoreError(f"batching.max_nodes={size.max_nodes}: not for data of several scales; choose batching=by_number")
         largest = max(t.num_nodes for t in data.trajectories)
         fewest = size.num_graphs if size.max_nodes is None else size.max_nodes // largest
         if fewest < ranks.num_ranks() > 1:

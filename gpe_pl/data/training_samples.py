@@ -35,6 +35,7 @@ class UnrollStart:
         solver_targets: computes targets with the solver instead of with the two corrections; None without a solver.
         alive: nodes of ``truth`` that are in the scene in each frame [num_steps + 2, node], if the data set has open scenes. The identity of a node is then
             its column in ``truth``, and its positions before and after are those of ``open_windows.continued``.
+        scale: rest spacing [m] and frame interval [s] of the scene, if the data have several; the scenes of a batch share them.
     """
 
     state: State
@@ -47,6 +48,7 @@ class UnrollStart:
     lane: int
     solver_targets: SolverTargets | None = None
     alive: Tensor | None = None
+    scale: tuple[float, float] | None = None
 
     @property
     def num_steps(self) -> int:

@@ -26,7 +26,7 @@ from gpe_pl.metrics import OneStepNMSE, rollout_metrics
 from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.schema import param_names
 from gpe_pl.system.progress import Bars, no_bar
-from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 log = logging.getLogger(__name__)
 
@@ -88,6 +88,8 @@ def evaluate(
         ExportError, PageError: a format in ``settings.export`` cannot be written.
         RigidBodyError: a scene has rigid bodies, which a format in ``settings.export`` would ignore.
     """
+    if members_of(simulator)[0].builder.config.scales != "one":
+        simulator = simulator.on(_scene_in(root, settings.splits[0], stride))
     first = members_of(simulator)[0]
     frame_dt = first.builder.metadata.frame_dt
     start_frame = settings.first_frame(first.builder.config.history, frame_dt)
@@ -110,6 +112,11 @@ def evaluate(
     write_cost(run_dir, predictor.seconds, frame_dt)
     write_rows(run_dir / "metrics.csv", rows)
     return rows
+
+
+def _scene_in(root: Path, split: str, stride: int) -> Metadata:
+    """Return the metadata of a split at a stride."""
+    return open_split(root, split, cache_bytes=0)[0].window(0, 1).metadata.every(stride)
 
 
 def _as_evaluated(simulator: LearnedSimulator | LearnedEnsemble, settings: EvaluationSettings) -> LearnedSimulator | LearnedEnsemble:
@@ -156,8 +163,7 @@ def one_step_nmse(
         SceneError: every ``stride``-th frame of the data does not fit the simulator.
     """
     views = every(usable(open_split(root, split), stride), stride)
-    members = members_of(simulator)
-    members[0].check_scene(views[0].window(0, 1).metadata)
+    members = members_of(simulator.on(views[0].window(0, 1).metadata))
     datasets = [WindowDataset(views, member.builder) for member in members]
     windows = np.unique(np.linspace(0, len(datasets[0]) - 1, min(len(datasets[0]), num_windows)).round().astype(int))
     metric = OneStepNMSE().to(members[0].acceleration_std.device)

@@ -61,6 +61,8 @@ def check(simulator: LearnedSimulator) -> None:
         wrong = f"a model in {builder.metadata.dim}D"
     elif builder.metadata.periodicity:
         wrong = "a model of a periodic domain"
+    elif builder.config.scales != "one":
+        wrong = "a model of several spacings and frame intervals"
     elif builder.spec.loads:
         wrong = "a model of scenes with prescribed nodes or forces"
     elif len(builder.spec.materials) > 1:

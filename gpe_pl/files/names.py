@@ -123,3 +123,8 @@ def _is_device(part: str) -> bool:
 def _quoted(name: Any, most: int = 100) -> str:
     text = repr(name)
     return text if len(text) <= most else f"{text[:most]}…"
+
+
+def spacing_suffix(factor: float | int) -> str:
+    """Return what the name of a data set with another ``data.spacing_factor`` ends with."""
+    return "" if factor == 1 else f"_spacing_{factor:g}"

@@ -10,7 +10,7 @@ if it were missing. Each undirected edge is stored once. There are no edges betw
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -86,6 +86,7 @@ class GraphBuilder:
         config: settings of the graph.
         metadata: metadata of the data set.
         skips: levels of skipping. Those that act here are exact, so they do not change the graph.
+        reference: metadata of the data set whose scales are the units of all others, with ``config.scales`` other than ``one``; None for ``metadata``.
         precision: floating-point type of ``x``, ``odd``, ``even``, ``mass`` and ``pos``.
 
     Raises:
@@ -95,6 +96,7 @@ class GraphBuilder:
     config: GraphConfig
     metadata: Metadata
     skips: Skips = field(default_factory=Skips)
+    reference: Metadata | None = None
     precision: ClassVar[torch.dtype] = torch.float32
 
     def __post_init__(self) -> None:
@@ -103,7 +105,15 @@ class GraphBuilder:
 
     @cached_property
     def scales(self) -> Scales:
-        return scales_of(self.config, self.metadata)
+        return scales_of(self.config, self.metadata, self.reference)
+
+    def at(self, spacing: float, frame_dt: float) -> GraphBuilder:
+        """Return the builder for scenes of another rest spacing [m] and frame interval [s]; the connectivity radius follows the spacing."""
+        known = self.reference or self.metadata
+        if (spacing, frame_dt) == (self.metadata.spacing, self.metadata.frame_dt):
+            return self
+        radius = known.connectivity_radius * spacing / known.spacing
+        return replace(self, metadata=replace(known, spacing=spacing, frame_dt=frame_dt, connectivity_radius=radius), reference=known)
 
     @cached_property
     def spec(self) -> FeatureSpec:
@@ -187,7 +197,7 @@ class GraphBuilder:
             store = data[material]
             store.x = self._rounded(material_features(history[r], state.gravity, self.scales))
             store.material_params = state.material_params[r][:, self.metadata.columns_of(material)].float()
-            store.mass = self._rounded(state.mass[r])
+            store.mass = self._rounded(state.mass[r] / self.scales.length_ratio**self.spec.dim)
             store.node_id = r
         if topology.boundary_rows is not None:
             boundary = _part(boundary, topology.boundary_rows)

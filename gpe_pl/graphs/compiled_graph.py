@@ -12,7 +12,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.graphs import compiled_features
 from gpe_pl.graphs.assembly import assembled
-from gpe_pl.graphs.features import GraphConfig, Scales, history_of
+from gpe_pl.graphs.features import AHEAD_CHANNELS, GraphConfig, Scales, ahead_features, history_of
 from gpe_pl.graphs.standards import Standards
 from gpe_pl.graphs.topology import IslandTopology, MeshTopology, Topology
 from gpe_pl.schema import BOUNDARY, RADIUS, EdgeType, FeatureSpec, grid
@@ -102,15 +102,20 @@ class CompiledGraph:
 
     def _material(self, material: str, rows: Tensor, history: np.ndarray, scenes: Scenes, mass: np.ndarray, state: State) -> dict[str, Any]:
         r, scales = rows.numpy(), self.scales
-        x = self._new(len(r), (history.shape[1] + 1) * self.spec.dim)  # ``load_features`` adds those of loads
+        num_channels = (history.shape[1] + 1) * self.spec.dim
+        x = self._new(len(r), num_channels)  # ``load_features`` adds those of loads
         units, statistics = (scales.velocity, scales.acceleration), self.standards.node[material]
         compiled_features.motion(history, r, scenes.gravity, scenes.starts[material], NO_LEVEL, *units, *statistics, x)
+        if scales.numbers:
+            mean, inverse = (values[num_channels:] for values in statistics)
+            numbers = (np.array(scales.numbers).astype(self.precision) - mean) * inverse
+            x = np.concatenate([x, np.tile(numbers, (len(r), 1))], axis=1)
         params = self.standards.of_params(material, _array(state.material_params)[r][:, self.metadata.columns_of(material)])
         unit = self.precision.type(self.standards.mass)
         return {
             "x": torch.from_numpy(x),
             "material_params": torch.from_numpy(np.ascontiguousarray(params)),
-            "mass": torch.from_numpy(mass[r].astype(self.precision) / unit),
+            "mass": torch.from_numpy((mass[r] / scales.length_ratio**self.spec.dim).astype(self.precision) / unit),
             "node_id": rows,
         }
 
@@ -137,15 +142,31 @@ class CompiledGraph:
                 there = _array(b.pos), _array(b.vel), rows[BOUNDARY], _array(b.normal)
             else:
                 there = pos, vel, rows[source], NO_ROWS
-            channels = dim, self.spec.odd_channels[relation], self.spec.even_channels[relation]
+            is_told = self.scales.use == "dimensionless" and self.config.features == "contact"
+            channels = dim, self.spec.odd_channels[relation], self.spec.even_channels[relation] - AHEAD_CHANNELS * is_told
             offset, odd, even = (self._new(index.shape[1], c) for c in channels)
             compiled_features.contacts(
                 *there, pos, vel, rows[target], index, period, units, self.standards.odd[relation], *self.standards.even[relation],
                 offset, odd, even,
             )  # fmt: skip
+            if is_told:
+                even = np.concatenate([even, self._ahead(there, (pos, vel, rows[target]), index, topology, relation)], axis=1)
             values = zip(("odd", "even", "offset"), (odd, even, offset), strict=True)
             stores[relation] = {"edge_index": edge_index, **{key: torch.from_numpy(value) for key, value in values}}
         return stores
+
+    def _ahead(
+        self, source: tuple[np.ndarray, ...], target: tuple[np.ndarray, ...], index: np.ndarray, topology: Topology, relation: EdgeType
+    ) -> np.ndarray:
+        """Return the standardised ``features.ahead_features`` of the edges of a relation."""
+        (pos, vel, rows, normal), (target_pos, target_vel, target_rows) = source, target
+        j, i = rows[index[0]], target_rows[index[1]]
+        displacement = topology.periodicity.shortest(torch.from_numpy(target_pos[i] - pos[j]))
+        velocity = torch.from_numpy(target_vel[i] - vel[j])
+        wall = torch.from_numpy(normal[j]) if len(normal) else None
+        values = ahead_features(displacement, velocity, wall, self.scales).numpy().astype(self.precision)
+        mean, inverse = (of_channel[-AHEAD_CHANNELS:] for of_channel in self.standards.even[relation])
+        return (values - mean) * inverse
 
     def _mesh(
         self, topology: Topology, mesh: MeshTopology, pos: np.ndarray, history: np.ndarray, mass: np.ndarray, gravity: np.ndarray

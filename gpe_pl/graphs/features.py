@@ -5,6 +5,7 @@ minus one rest spacing), the direction of walls, and in meshes the difference fr
 even channels do not. Features have the double precision of states.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -33,11 +34,16 @@ from gpe_pl.trajectory.trajectory import Metadata
 
 Features = Literal["paper", "contact"]
 ParameterScale = Literal["linear"]
+ScaleUse = Literal["one", "dimensional", "dimensionless"]
 
 GAP_SCALE = 0.2
 """Unit of gaps in features, as a fraction of the rest spacing."""
 GAP_LIMIT = 6.0
 """Largest gap in features, in the unit of gaps. Larger gaps are clipped, so that the channel resolves contacts."""
+SCALE_CHANNELS = 2
+"""Number of node channels with ``scales=dimensionless``, see ``Scales.numbers``."""
+AHEAD_CHANNELS = 2
+"""Number of even edge channels with ``scales=dimensionless``, see ``ahead_features``."""
 TINY = 1e-12
 """Length given to an edge between coincident nodes, in rest spacings or widths of a level."""
 
@@ -59,6 +65,8 @@ class GraphConfig:
         num_levels: number of levels of virtual nodes; None takes as many as a body of the size of the domain needs for a single root.
         islands: find the connected groups of nodes, and those without an edge to the boundary; see ``nn.island_momentum``.
         cells: include the cells of meshes and their rest shape, for ``model.elastic``; needs ``mesh`` and ``islands``.
+        scales: ``one`` if all data have one spacing and one frame interval. With ``dimensionless``, they may vary, and models get both as features (see
+            ``Scales``). With ``dimensional``, they may vary, too, and models are not told.
     """
 
     features: Features = "contact"
@@ -71,49 +79,95 @@ class GraphConfig:
     num_levels: Annotated[int, Field(ge=0, le=20)] | None = None
     islands: bool = False
     cells: bool = False
+    scales: ScaleUse = "one"
 
 
 @dataclass(frozen=True)
 class Scales:
-    """Physical scales of a data set, by which features are divided.
+    """Physical scales of a scene, by which features are divided.
+
+    Let h be the rest spacing, Δt the frame interval, and h₀ and Δt₀ those of the ``reference``. Lengths are divided by h, and accelerations by h₀/Δt₀². The
+    unit of velocities depends on ``use``::
+
+        one             h/Δt             the reference is the scene itself
+        dimensional     h₀/Δt₀           a constant
+        dimensionless   Δt h₀/Δt₀²       the velocity that the unit of acceleration gives in one frame
 
     Attributes:
         radius: radius of the edges between nodes [m].
         spacing: rest spacing [m].
         frame_dt: frame interval [s].
+        reference: rest spacing [m] and frame interval [s] of the reference; None for the scene itself.
+        use: as ``GraphConfig.scales``.
     """
 
     radius: float
     spacing: float
     frame_dt: float
+    reference: tuple[float, float] | None = None
+    use: ScaleUse = "one"
 
     @property
     def velocity(self) -> float:
-        """One rest spacing per frame [m/s]."""
-        return self.spacing / self.frame_dt
+        """Unit of velocities [m/s]."""
+        if self.use == "dimensionless":
+            return self.acceleration * self.frame_dt
+        spacing, frame_dt = self.reference or (self.spacing, self.frame_dt)
+        return spacing / frame_dt
 
     @property
     def acceleration(self) -> float:
-        """One rest spacing per frame squared [m/s²]."""
-        return self.spacing / self.frame_dt**2
+        """Unit of accelerations [m/s²]."""
+        spacing, frame_dt = self.reference or (self.spacing, self.frame_dt)
+        return spacing / frame_dt**2
+
+    @property
+    def length_ratio(self) -> float:
+        """Rest spacing over that of the reference. Masses of nodes are divided by its power of the dimension."""
+        return 1.0 if self.reference is None else self.spacing / self.reference[0]
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Dimensionless numbers of the scene that models get as node features; none unless ``use`` is ``dimensionless``.
+
+        They are log₂ of g Δt²/h (a Froude number) and of c Δt/h (the stiffness × frame / spacing), each over its value at the reference. Gravity g and the
+        speed c of sound are those of the data set, so they cancel.
+        """
+        if self.use != "dimensionless":
+            return ()
+        spacing, frame_dt = self.reference or (self.spacing, self.frame_dt)
+        length, time = self.spacing / spacing, self.frame_dt / frame_dt
+        return math.log2(time**2 / length), math.log2(time / length)
 
 
-def scales_of(config: GraphConfig, metadata: Metadata) -> Scales:
-    """Return the scales of a data set, with the radius of the graph configuration if it names one."""
+def scales_of(config: GraphConfig, metadata: Metadata, reference: Metadata | None = None) -> Scales:
+    """Return the scales of a scene, with the radius of the graph configuration if it names one.
+
+    Args:
+        config: settings of the graphs.
+        metadata: metadata of the scene.
+        reference: metadata of the reference, if spacing and frame interval may differ from it (``config.scales``).
+    """
     own = config.connectivity_spacings
-    return Scales(metadata.connectivity_radius if own is None else own * metadata.spacing, metadata.spacing, metadata.frame_dt)
+    radius = metadata.connectivity_radius if own is None else own * metadata.spacing
+    if config.scales == "one":
+        return Scales(radius, metadata.spacing, metadata.frame_dt)
+    known = reference or metadata
+    return Scales(radius, metadata.spacing, metadata.frame_dt, (known.spacing, known.frame_dt), config.scales)
 
 
 def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     """Return the channel counts of a data set's graphs.
 
     Raises:
-        GraphError: ``config.cells`` without ``mesh`` or ``islands``.
+        GraphError: ``config.cells`` without ``mesh`` or ``islands``, or several scales with meshes or loads.
     """
     if config.cells and not (config.mesh and config.islands):
         raise GraphError("graph.cells=true needs graph.mesh=true graph.islands=true; choose these, or law=none")
     dim, materials = metadata.dim, metadata.materials
     meshes = set(materials) & set(MESH_MATERIALS) if config.mesh else set()
+    if config.scales != "one" and (meshes or metadata.loads):
+        raise GraphError(f"graph.scales={config.scales}: works with particles only; set graph.mesh=false, or graph.scales=one")
     if not meshes:
         num_levels = 0
     elif config.num_levels is not None:
@@ -123,14 +177,15 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     relations = (*radius_relations(materials), *(mesh_relations(materials, num_levels) if meshes else ()))
     motion = (config.history + 1) * dim
     virtual = {grid(level): motion + 1 for level in range(1, num_levels + 1)}
-    channels = {r: _edge_channels(config.features, r, dim) for r in relations}
+    is_told = config.scales == "dimensionless"
+    channels = {r: _edge_channels(config.features, r, dim, is_told) for r in relations}
     loads = metadata.loads or ()
     of_loads = (1 + dim) * ("motion" in loads) + dim * ("force" in loads)
     return FeatureSpec(
         dim=dim,
         materials=materials,
         node_channels={
-            **dict.fromkeys(materials, motion + of_loads),
+            **dict.fromkeys(materials, motion + of_loads + SCALE_CHANNELS * is_told),
             BOUNDARY: 2 * dim + 2 if config.boundary_condition else dim,
             **virtual,
         },
@@ -146,17 +201,17 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     )
 
 
-def _edge_channels(features: Features, relation: EdgeType, dim: int) -> tuple[int, int]:
+def _edge_channels(features: Features, relation: EdgeType, dim: int, is_told: bool) -> tuple[int, int]:
     """Return the numbers of odd and even channels of ``edge_features`` (``radius``) and ``mesh_features`` (all other relations)."""
     if features == "paper":
         return dim, 0
     if relation[1] == RADIUS:
-        return 3 * dim, 4
+        return 3 * dim, 4 + AHEAD_CHANNELS * is_told
     return 4 * dim, 3 if relation[1] == CELL else 4
 
 
 def material_features(velocity_history: Float64[Tensor, "node history dim"], gravity: Float64[Tensor, " dim"], scales: Scales) -> Tensor:
-    """Return motion and external acceleration of dynamic nodes [node, (history + 1) · dim].
+    """Return motion and external acceleration of dynamic nodes [node, (history + 1) · dim], with ``Scales.numbers`` behind them if there are some.
 
     The velocity history enters as the last velocity and the earlier changes of velocity. A change is about a tenth of a velocity, so it would hardly be visible
     in the earlier velocities.
@@ -164,7 +219,8 @@ def material_features(velocity_history: Float64[Tensor, "node history dim"], gra
     n = velocity_history.shape[0]
     changes = velocity_history[:, 1:] - velocity_history[:, :-1]
     motion = torch.cat([velocity_history[:, -1:], changes.flip(1)], dim=1).flatten(1) / scales.velocity
-    return torch.cat([motion, (gravity / scales.acceleration).expand(n, -1)], dim=1)
+    features = torch.cat([motion, (gravity / scales.acceleration).expand(n, -1)], dim=1)
+    return torch.cat([features, motion.new_tensor(scales.numbers).expand(n, -1)], dim=1) if scales.numbers else features
 
 
 def boundary_features(config: GraphConfig, boundary: Boundary, scales: Scales) -> Tensor:
@@ -214,7 +270,28 @@ def edge_features(
         wall_approach = (velocity * normal).sum(dim=1, keepdim=True)
     odd = torch.cat([relative, unit, velocity], dim=1)
     even = torch.cat([gap, approach, wall, wall_approach], dim=1)
+    if scales.use == "dimensionless":
+        even = torch.cat([even, ahead_features(displacement, relative_velocity, normal, scales)], dim=1)
     return odd, even
+
+
+def ahead_features(
+    displacement: Float[Tensor, "edge dim"],
+    relative_velocity: Float[Tensor, "edge dim"],
+    normal: Float[Tensor, "edge dim"] | None,
+    scales: Scales,
+) -> Float[Tensor, "edge 2"]:
+    """Return the gap, and the distance along the wall's normal, that an edge would have one frame later if velocities stayed.
+
+    They are in the unit of gaps and clipped like gaps. Without them, a model would have to multiply velocities by the frame interval. Arguments are those of
+    ``edge_features``.
+    """
+    way = relative_velocity * scales.frame_dt
+    distance = (displacement.square().sum(dim=1, keepdim=True) + (TINY * scales.spacing) ** 2).sqrt()
+    later = distance + (way * displacement).sum(dim=1, keepdim=True) / distance
+    wall = torch.zeros_like(later) if normal is None else ((displacement + way) * normal).sum(dim=1, keepdim=True)
+    reached = torch.cat([later / scales.spacing - 1, wall / scales.spacing], dim=1)
+    return (reached / GAP_SCALE).clamp(-GAP_LIMIT, GAP_LIMIT)
 
 
 def virtual_features(

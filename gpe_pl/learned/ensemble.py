@@ -51,6 +51,10 @@ class LearnedEnsemble(Ensemble):
                 )
         return cls(members)
 
+    def on(self, scene: Metadata) -> LearnedEnsemble:
+        """Do the same as ``LearnedSimulator.on`` for all members."""
+        return LearnedEnsemble(tuple(member.on(scene) for member in self.members))
+
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
         """Do the same as ``LearnedSimulator.initial_state``."""
         return self.members[0].initial_state(trajectory, frame)

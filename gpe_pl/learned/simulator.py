@@ -21,23 +21,23 @@ from jaxtyping import Float64
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
-from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.compiled_graph import works_on
-from gpe_pl.graphs.features import GraphConfig, history_of
+from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
 from gpe_pl.graphs.standards import Standards
 from gpe_pl.graphs.topology import Topology
-from gpe_pl.learned import next_states, transfer
+from gpe_pl.learned import next_states, training_ranges, transfer
 from gpe_pl.learned.checkpoint_file import CheckpointError as CheckpointError
 from gpe_pl.learned.checkpoint_file import load_checkpoint, reason
 from gpe_pl.learned.mirror_average import MirrorAverage
 from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.pretrained import checkpoint_path
 from gpe_pl.learned.rollout_settings import RolloutSettings
-from gpe_pl.learned.training_ranges import named_materials, outside_masses, outside_parameters, stored_ranges
+from gpe_pl.learned.start_checks import SceneError as SceneError
+from gpe_pl.learned.start_checks import check_start
 from gpe_pl.learned.transfer import Transfer
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
@@ -46,7 +46,7 @@ from gpe_pl.nn.static_friction import keeps_position, supported
 from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.rollout.loop import SimulationError, sound
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.schema import BOUNDARY, EdgeType, node_code
+from gpe_pl.schema import BOUNDARY, EdgeType
 from gpe_pl.system.signatures import check_plain, checked
 from gpe_pl.trajectory.rigid_bodies import all_of_bodies
 from gpe_pl.trajectory.scene_ranges import described, outside, scene_range, unlimited
@@ -56,10 +56,6 @@ from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 log = logging.getLogger(__name__)
 
 CHECKPOINT_FORMAT = 3
-
-
-class SceneError(GpeError, ValueError):
-    """Raised when a scene does not fit a trained simulator, or has invalid values."""
 
 
 class LearnedSimulator(nn.Module):
@@ -78,6 +74,7 @@ class LearnedSimulator(nn.Module):
         mirror_average: average each step of a rollout over the scene and its mirror images (see ``mirror_average``).
         acceleration_std, stress_std: units of the model's accelerations [m/s²] and stresses [Pa].
         trained_scene, trained_mass: ranges in training, as in ``scene_ranges`` and ``training_ranges.outside_masses``.
+        trained_scales: range in training, as in ``training_ranges.scale_range``. Only models with ``graph.scales`` other than ``one`` have it.
 
     You may change the first four attributes at any time. Of them, ``save`` stores ``static_friction`` and ``mirror_average``.
     """
@@ -87,6 +84,7 @@ class LearnedSimulator(nn.Module):
     stress_std: Tensor
     trained_scene: Tensor
     trained_mass: Tensor
+    trained_scales: Tensor
     clamps_parameters: bool = True
     mirror_average: bool = False
 
@@ -101,6 +99,8 @@ class LearnedSimulator(nn.Module):
         self.register_buffer("stress_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("trained_scene", torch.from_numpy(unlimited(builder.spec.dim)))
         self.register_buffer("trained_mass", self._any_mass())
+        if builder.config.scales != "one":
+            self.register_buffer("trained_scales", training_ranges.scale_range([builder.metadata]))
         for material, count in builder.spec.param_channels.items():
             self.register_buffer(
                 f"trained_{material}", torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).expand(2, count).clone()
@@ -131,6 +131,24 @@ class LearnedSimulator(nn.Module):
                 setattr(other, name, value)
         return other
 
+    def at(self, spacing: float | None = None, frame_dt: float | None = None) -> LearnedSimulator:
+        """Return a copy for another rest spacing [m] or frame interval [s]; None keeps it. The copy shares the weights. Errors are those of ``on``."""
+        own = self.builder.metadata
+        return self.on(replace(own, spacing=spacing or own.spacing, frame_dt=frame_dt or own.frame_dt))
+
+    def on(self, scene: Metadata) -> LearnedSimulator:
+        """Return this model for the rest spacing and frame interval of a scene (see ``at``). Models of one scale return themselves.
+
+        Raises:
+            SceneError: the scene does not fit (``fits``).
+        """
+        self.check_scene(scene)
+        if self.builder.config.scales == "one":
+            return self
+        other = copy.copy(self)
+        other.builder = self.builder.at(scene.spacing, scene.frame_dt)
+        return other
+
     @property
     def static_friction(self) -> float:
         return self._static_friction
@@ -150,7 +168,11 @@ class LearnedSimulator(nn.Module):
 
     @torch.no_grad()
     def fit_statistics(
-        self, graphs: Iterable[HeteroData], parameter_ranges: Mapping[str, Tensor] | None = None, trained_scene: np.ndarray | None = None
+        self,
+        graphs: Iterable[HeteroData],
+        parameter_ranges: Mapping[str, Tensor] | None = None,
+        trained_scene: np.ndarray | None = None,
+        trained_scales: Tensor | None = None,
     ) -> None:
         """Set the statistics of features, the trained ranges, and the scales of acceleration and stress from training graphs with ``target``.
 
@@ -162,6 +184,7 @@ class LearnedSimulator(nn.Module):
                 and relations.
             parameter_ranges: lowest and highest value [2, param] of each material's parameters in all training data; None takes those of the sample.
             trained_scene: range of gravity and boundary nodes in all training scenes, as in ``scene_ranges``; None leaves it unlimited.
+            trained_scales: range of spacings and frame intervals, as in ``training_ranges.scale_range``; None takes those of the builder.
 
         Raises:
             ValueError: all accelerations are zero, or some are not finite.
@@ -190,6 +213,8 @@ class LearnedSimulator(nn.Module):
                 self.trained_mass[:, k] = torch.stack([mass.min(), mass.max()])
         if trained_scene is not None:
             self.trained_scene.copy_(torch.from_numpy(trained_scene))
+        if trained_scales is not None and self.builder.config.scales != "one":
+            self.trained_scales.copy_(trained_scales)
         if parameter_ranges is None:
             params = {m: torch.cat([g[m].material_params for g in sample.of(m)]) for m, _ in self.trained_ranges()}
             parameter_ranges = {m: torch.stack([p.amin(dim=0), p.amax(dim=0)]) for m, p in params.items() if len(p)}
@@ -225,13 +250,15 @@ class LearnedSimulator(nn.Module):
             if math.isfinite(high):
                 yield f"mass of nodes of {material}", f"{low:g} to {high:g} kg"
         yield from described(self.trained_scene.cpu().numpy())
+        if self.builder.config.scales != "one":
+            yield from training_ranges.described_scales(self.trained_scales)
 
     def untrained_parameters(self, state: State) -> list[str]:
         """Return one line for each material parameter of a scene that is outside the range of training."""
         return [line for _, line in self._outside_parameters(state)]
 
     def _outside_parameters(self, state: State) -> Iterator[tuple[str, str]]:
-        return outside_parameters(state, self.builder.metadata, self.trained_ranges())
+        return training_ranges.outside_parameters(state, self.builder.metadata, self.trained_ranges())
 
     def untrained_scene(self, state: State) -> list[str]:
         """Return one line for each material's mass, for gravity, and for each property of boundary nodes, if a scene leaves the range of training there."""
@@ -241,7 +268,10 @@ class LearnedSimulator(nn.Module):
         own = self.builder.metadata
         here = scene_range(state.gravity.cpu().numpy(), state.boundary.to_numpy(), state.periodicity)
         yield from outside(self.trained_scene.cpu().numpy(), here, own.spacing / own.frame_dt)
-        yield from outside_masses(state, self.builder.spec.materials, self.trained_mass)
+        cell = self.builder.scales.length_ratio**self.builder.spec.dim  # trained masses are those at the spacing of the reference
+        yield from training_ranges.outside_masses(state, self.builder.spec.materials, self.trained_mass * cell)
+        if self.builder.config.scales != "one":
+            yield from training_ranges.outside_scales(own, self.trained_scales)
 
     def forward(self, data: HeteroData) -> Prediction:
         """Return the model's prediction for a graph whose features are not standardised."""
@@ -261,7 +291,7 @@ class LearnedSimulator(nn.Module):
             SceneError: the frame interval, spacing, dimension or materials differ from training, or a value is not finite or breaks its rule; the message names
             the node.
         """
-        self.check_scene(trajectory.metadata)
+        self._check_own(trajectory.metadata)
         own, scene = self.builder.metadata, trajectory.metadata
         if scene.solver == own.solver and scene.solver_version != own.solver_version:
             version = f"version {scene.solver_version} of the solver {scene.solver}, in training version {own.solver_version}"
@@ -275,15 +305,18 @@ class LearnedSimulator(nn.Module):
         Raises:
             SceneError: as ``initial_state``.
         """
-        self.check_scene(scene)
+        self._check_own(scene)
         state = state.to_torch(self.acceleration_std.device)
         history = state.vel[:, None].expand(-1, self.builder.config.history, -1)
         return self._checked(replace(state, velocity_history=history.clone(), frame_velocity=None), "start")
 
     def fits(self, scene: Metadata) -> bool:
-        """Return whether a scene has the frame interval, spacing (to 1 %), dimension and material parameters of training, and only its materials and loads."""
-        own = self.builder.metadata
-        same_scales = abs(scene.frame_dt / own.frame_dt - 1) < 1e-6 and abs(scene.spacing / own.spacing - 1) < 0.01
+        """Return whether a scene has the frame interval, spacing (to 1 %), dimension and material parameters of training, and only its materials and loads.
+
+        A model of several scales fits if spacing and frame interval are at most ``training_ranges.FARTHEST`` times outside their ranges in training.
+        """
+        own, has_one = self.builder.metadata, self.builder.config.scales == "one"
+        same_scales = training_ranges.have_same_scales(own, scene) if has_one else training_ranges.are_near(scene, self.trained_scales)
         same_channels = scene.dim == own.dim and scene.param_names == own.param_names
         known_loads = {*(scene.loads or ())} <= {*(own.loads or ())}
         return same_scales and same_channels and known_loads and {*scene.materials} <= {*own.materials}  # materials can share parameters
@@ -294,15 +327,30 @@ class LearnedSimulator(nn.Module):
         Raises:
             SceneError: the scene does not fit (``fits``).
         """
+        if self.fits(scene):
+            return
+        own, choice = self.builder.metadata, choice or "data=… size=…"
+        if (stride := self.stride_on(scene)) > 1 and choice == "data=… size=…":
+            choice = f"every frame number {stride}: Trajectory.every({stride}), or data.stride={stride}"
+        strided = f" (data.stride={self.stride})" if self.stride > 1 else ""
+        scales = f"frame_dt={own.frame_dt:g} s{strided} and spacing={own.spacing:g} m"
+        if self.builder.config.scales != "one":
+            scales = " and ".join(f"{name} {values}" for name, values in training_ranges.described_scales(self.trained_scales))
+            choice = f"scales at most {training_ranges.FARTHEST:g} times outside these"
+        raise SceneError(
+            f"the model was trained with {scales} in {own.dim}D on {training_ranges.named_materials(own)}; "
+            f"the scene has frame_dt={scene.frame_dt:g} s and spacing={scene.spacing:g} m in {scene.dim}D and "
+            f"{training_ranges.named_materials(scene)}; choose the data set with {choice}"
+        )
+
+    def _check_own(self, scene: Metadata) -> None:
+        """Raise ``SceneError`` for a scene that does not fit, or, with several scales, for one of another scale than this copy's."""
+        self.check_scene(scene)
         own = self.builder.metadata
-        if not self.fits(scene):
-            if (stride := self.stride_on(scene)) > 1:
-                choice = choice or f"every frame number {stride}: Trajectory.every({stride}), or data.stride={stride}"
-            strided = f" (data.stride={self.stride})" if self.stride > 1 else ""
+        if not training_ranges.have_same_scales(own, scene):
             raise SceneError(
-                f"the model was trained with frame_dt={own.frame_dt:g} s{strided} and spacing={own.spacing:g} m in {own.dim}D on {named_materials(own)}; "
-                f"the scene has frame_dt={scene.frame_dt:g} s and spacing={scene.spacing:g} m in {scene.dim}D and "
-                f"{named_materials(scene)}; choose the data set with {choice or 'data=… size=…'}"
+                f"this copy of the model is for frame_dt={own.frame_dt:g} s and spacing={own.spacing:g} m, the scene has {scene.frame_dt:g} s and "
+                f"{scene.spacing:g} m; take simulator.on(trajectory.metadata)"
             )
 
     def stride_on(self, stored: Metadata) -> int:
@@ -311,25 +359,7 @@ class LearnedSimulator(nn.Module):
         return stride if stride >= 1 and self.fits(stored.every(stride)) else 0
 
     def _checked(self, state: State, where: str) -> State:
-        at_frame = state.vel if state.frame_velocity is None else state.frame_velocity
-        for name, values in (("pos", state.pos), ("velocity", history_of(state)), ("velocity at the frame", at_frame)):
-            bad = ~torch.isfinite(values).flatten(1).all(dim=1)
-            if bad.any():
-                raise SceneError(
-                    f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite; correct it, or start at another frame"
-                )
-        bad = ~(torch.isfinite(state.mass) & (state.mass > 0))
-        if bad.any():
-            node = int(bad.nonzero()[0])
-            raise SceneError(f"node {node} has a mass of {float(state.mass[node]):g} kg; give every node a positive and finite mass")
-        for material, trained in self.trained_ranges():
-            rows = torch.nonzero(state.node_type == node_code(material)).flatten()
-            for spec, number, _ in stored_ranges(self.builder.metadata, material, trained):
-                column = state.material_params[rows, number]
-                wrong = ~spec.accepts(column)
-                if wrong.any():
-                    node, value = int(rows[wrong][0]), float(column[wrong][0])
-                    raise SceneError(f"node {node} ({material}): {spec.name} is {spec.quantity(value)}, must be {spec.rule}")
+        check_start(state, self.builder.metadata, where)
         clamped = "; clamped to the nearest trained value" if self.clamps_parameters else ""
         found = [(kind, line + clamped) for kind, line in self._outside_parameters(state)]
         for kind, line in (*found, *self._outside_scene(state)):
@@ -499,7 +529,7 @@ class LearnedSimulator(nn.Module):
             "model": f"{cls.__module__}.{cls.__qualname__}",
             "settings": dict(self.model.settings),
             "graph": asdict(self.builder.config),
-            "metadata": asdict(self.builder.metadata),
+            "metadata": asdict(self.builder.reference or self.builder.metadata),
             "static_friction": self.static_friction,
             "mirror_average": self.mirror_average,
             "stride": self.stride,

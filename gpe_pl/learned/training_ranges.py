@@ -1,9 +1,11 @@
-"""Comparison of a scene's material parameters and masses with their ranges in training."""
+"""Comparison of a scene's material parameters, masses, spacing and frame interval with their ranges in training."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
+import torch
+from jaxtyping import Float64
 from torch import Tensor
 
 from gpe_pl.schema import MaterialParameter, node_code, param_names
@@ -12,6 +14,10 @@ from gpe_pl.trajectory.trajectory import Metadata
 
 RANGE_TOLERANCE = 1e-5
 """Relative difference of material parameters that counts as none, because they are stored in single precision."""
+SCALE_TOLERANCE = 1e-6
+"""Relative difference of spacings and frame intervals that counts as none."""
+FARTHEST = 2.0
+"""Factor by which spacing and frame interval of a scene may be outside their ranges in training."""
 MASS_FACTOR = 2.0
 """Factor by which masses of nodes may leave the range of training: corners of meshes differ between bodies of one kind."""
 
@@ -59,6 +65,39 @@ def outside_masses(state: State, materials: Sequence[str], trained: Tensor) -> I
         if bool(is_outside.any()):
             kind = f"mass of nodes of {material}"
             yield kind, f"{kind} is {mass[is_outside][0].item():g} kg, in training it was {low:g} to {high:g} kg"
+
+
+def scale_range(scenes: Iterable[Metadata]) -> Float64[Tensor, "2 scale"]:
+    """Return the lowest and highest rest spacing [m] and frame interval [s] of scenes."""
+    found = torch.tensor([(scene.spacing, scene.frame_dt) for scene in scenes], dtype=torch.float64)
+    return torch.stack([found.amin(dim=0), found.amax(dim=0)])
+
+
+def have_same_scales(one: Metadata, other: Metadata) -> bool:
+    """Tell whether two scenes have the same frame interval, and the same spacing to 1 %."""
+    return abs(one.frame_dt / other.frame_dt - 1) < 1e-6 and abs(one.spacing / other.spacing - 1) < 0.01
+
+
+def are_near(scene: Metadata, trained: Tensor) -> bool:
+    """Tell whether spacing and frame interval of a scene are at most ``FARTHEST`` times outside their ranges in training (``scale_range``)."""
+    return all(
+        low / FARTHEST * (1 - SCALE_TOLERANCE) <= value <= high * FARTHEST * (1 + SCALE_TOLERANCE)
+        for value, (low, high) in zip((scene.spacing, scene.frame_dt), trained.T.tolist(), strict=True)
+    )
+
+
+def described_scales(trained: Tensor) -> Iterator[tuple[str, str]]:
+    """Yield the names of the two scales, each with its range in training and the unit."""
+    for name, unit, (low, high) in zip(("spacing", "frame interval"), ("m", "s"), trained.T.tolist(), strict=True):
+        yield name, f"{low:g} to {high:g} {unit}"
+
+
+def outside_scales(scene: Metadata, trained: Tensor) -> Iterator[tuple[str, str]]:
+    """Yield the kind of each scale of a scene that is outside the range of training, and a line that says so."""
+    named = zip((scene.spacing, scene.frame_dt), ("m", "s"), described_scales(trained), trained.T.tolist(), strict=True)
+    for value, unit, (name, values), (low, high) in named:
+        if not low * (1 - SCALE_TOLERANCE) <= value <= high * (1 + SCALE_TOLERANCE):
+            yield name, f"{name} is {value:g} {unit}, trained were {values}"
 
 
 def named_materials(metadata: Metadata) -> str:

@@ -69,6 +69,7 @@ class Scene:
         title: name of the scene in pictures.
         bodies, obstacles, zones: parts that were added, by name; zones are inlets and outlets.
         seed: seed of the random displacements of nodes from their lattice.
+        spacing, frame_dt: spacing of nodes [m] and frame interval [s], for models of several; None takes those that a model names.
 
     Raises:
         SceneFault: a value is impossible.
@@ -82,6 +83,8 @@ class Scene:
     obstacles: tuple[tuple[str, Any], ...] = ()
     seed: int = 0
     zones: tuple[Zone, ...] = ()
+    spacing: float | int | None = None
+    frame_dt: float | int | None = None
 
     def __post_init__(self) -> None:
         fault = "must have 2 or 3 sides [m], or (low, high) for each axis, such as (1.5, 1.0)"
@@ -92,6 +95,9 @@ class Scene:
         if len(box) not in (2, 3) or not all(math.isfinite(high - low) and low < high for low, high in box):
             raise SceneFault({"box": f"{fault}, got {self.box!r}"})
         object.__setattr__(self, "box", box)
+        for name in ("spacing", "frame_dt"):
+            if getattr(self, name) is not None:
+                self._positive("", name, getattr(self, name))
         down = (*(0.0,) * (len(box) - 1), -EARTH) if self.gravity is None else self.gravity
         object.__setattr__(self, "gravity", tuple(self._vector("gravity", "gravity", down).tolist()))
         walls = {f"{axis}_{side}" for axis in "xyz"[: len(box)] for side in ("low", "high")}
@@ -311,6 +317,8 @@ class Scene:
             raise SceneFault({"seconds": f"must be more than 0 and at most 3600, got {seconds}"})
         chosen = model or self.shipped()
         simulator = LearnedSimulator.from_checkpoint(chosen)
+        if self.spacing or self.frame_dt:
+            simulator = simulator.at(self.spacing, self.frame_dt)
         state, metadata = self.state(simulator)
         num_frames, name = max(2, round(seconds / metadata.frame_dt)), model_name(chosen, ".")
         rollouts: dict[str, Trajectory] = {}
@@ -326,8 +334,12 @@ class Scene:
         """Return the solver of the model's training data for this box, rounded up to whole cells of its grid."""
         own = simulator.builder.metadata
         cell = settings(own)["solver"].get("grid_spacing")
+        at_scale: dict[str, float] = {}
+        if simulator.builder.reference is not None:  # the settings are those of another scale
+            cell = None if cell is None else cell * simulator.builder.scales.length_ratio
+            at_scale = {"frame_dt": own.frame_dt} | ({} if cell is None else {"grid_spacing": cell})
         box = self.box if cell is None else [(low, low + cell * math.ceil((high - low) / cell - 1e-6)) for low, high in self.box]
-        return recorded_solver(own, bounds=box, materials=own.materials)
+        return recorded_solver(own, bounds=box, materials=own.materials, **at_scale)
 
     def shipped(self) -> str:
         """Return the name of the shipped model of the material; raises ``SceneFault`` if there are several materials."""

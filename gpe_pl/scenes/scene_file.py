@@ -32,7 +32,7 @@ from gpe_pl.scenes.scene import Scene, SceneFault
 MOST_BYTES = 1_000_000
 """Largest scene file [bytes]."""
 LISTS = ("bodies", "obstacles", "openings")
-TOP = ("box", "gravity", "friction", "title", "seed", *LISTS)
+TOP = ("box", "gravity", "friction", "title", "seed", "spacing", "frame_dt", *LISTS)
 BODIES = ("block", "ball", "polygon", "image")
 OPENINGS = ("inlet", "outlet")
 

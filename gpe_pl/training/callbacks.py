@@ -107,8 +107,14 @@ class RolloutValidation(Callback):
 
     def _rollouts(self, simulator: LearnedSimulator) -> list[tuple[Trajectory, Trajectory]]:
         """Return prediction and ground truth of this rank's trajectories."""
-        history = simulator.builder.config.history
         trajectories = self.trajectories[ranks.rank() :: ranks.num_ranks()]
+        scales = dict.fromkeys((t.metadata.spacing, t.metadata.frame_dt) for t in trajectories)
+        groups = [[t for t in trajectories if (t.metadata.spacing, t.metadata.frame_dt) == scale] for scale in scales]
+        return [pair for group in groups for pair in self._group(simulator.on(group[0].metadata), group)]
+
+    def _group(self, simulator: LearnedSimulator, trajectories: list[Trajectory]) -> list[tuple[Trajectory, Trajectory]]:
+        """Return prediction and ground truth of trajectories of one spacing and frame interval."""
+        history = simulator.builder.config.history
         truths = [t.frames(history, history + self.num_steps + 1) for t in trajectories]
         starts = []
         for trajectory, truth in zip(trajectories, truths, strict=True):
@@ -116,7 +122,7 @@ class RolloutValidation(Callback):
                 bounds=truth.metadata.bounds, margin=truth.metadata.longest_side
             )  # no max_speed: nodes that fast leave the domain
             starts.append(Start(simulator.initial_state(trajectory, history), truth.num_frames - 1, truth.metadata, guard))
-        contained = Contained(simulator, self.trajectories[0].metadata.frame_dt) if self.containment else simulator
+        contained = Contained(simulator, trajectories[0].metadata.frame_dt) if self.containment else simulator
         predicted = [own.with_nodes_of(truth) for own, truth in zip(rollouts(contained, starts), truths, strict=True)]
         return list(zip(predicted, truths, strict=True))
 

@@ -41,12 +41,14 @@ class Excursion:
         states: state that each unroll has reached.
         steps: number of steps that each unroll has made.
         rows: rows of the nodes of each material in ``states``; empty between ``move_on`` and the next call of ``graphs``.
+        scale: rest spacing and frame interval of the scenes, as in ``UnrollStart``.
     """
 
     samples: list[int]
     states: list[State]
     steps: list[int]
     rows: list[Rows]
+    scale: tuple[float, float] | None = None
 
 
 Stored = dict[int, dict[int, dict[str, Any]]]
@@ -96,7 +98,7 @@ class Excursions:
             simulator: makes unrolls and graphs.
             starts: starts of the scenes of one lane.
         """
-        samples, lane = [start.sample for start in starts], starts[0].lane
+        samples, lane, simulator = [start.sample for start in starts], starts[0].lane, _located(simulator, starts[0].scale)
         under_way = self._lanes.get(lane)
         if under_way is None or under_way.samples != samples:
             under_way = self._taken_up(lane, starts) or Excursion(samples, *unrolled(simulator, starts), [])
@@ -114,6 +116,7 @@ class Excursions:
                 found = simulator.builder.topology(start.state)
             topologies.append(found)
         under_way.rows = [topology.rows for topology in topologies]
+        under_way.scale = starts[0].scale
         self._lanes[lane] = under_way
         return training_batch(simulator.builder, topologies, under_way.states, starts, under_way.steps)
 
@@ -136,7 +139,8 @@ class Excursions:
             predicted: prediction for the lane's last ``graphs``.
         """
         under_way = self._lanes[lane]
-        later = simulator.later(under_way.states, under_way.rows, predicted.to(under_way.states[0].pos.device))
+        located = _located(simulator, under_way.scale)
+        later = located.later(under_way.states, under_way.rows, predicted.to(under_way.states[0].pos.device))
         pairs = zip(under_way.states, later, strict=True)
         under_way.states = [through_openings(state, after) if after.openings else after for state, after in pairs]
         under_way.steps = [step + 1 for step in under_way.steps]
@@ -170,6 +174,10 @@ def _moved(start: State, scene: dict[str, Any]) -> State:
     return replace(start, **values)
 
 
+def _located(simulator: LearnedSimulator, scale: tuple[float, float] | None) -> LearnedSimulator:
+    return simulator if scale is None else simulator.at(*scale)
+
+
 @dataclass(frozen=True)
 class _Trainable(Batched):
     """A learned simulator whose states can be used in training. States from ``LearnedSimulator.step_all`` can be used for inference only."""
@@ -188,7 +196,7 @@ def unrolled(simulator: LearnedSimulator, starts: Sequence[UnrollStart]) -> tupl
     """
     states, steps = [start.state for start in starts], [0] * len(starts)
     num_steps = {k: start.num_steps for k, start in enumerate(starts)}
-    was_training = simulator.training
+    was_training, simulator = simulator.training, _located(simulator, starts[0].scale)
     simulator.eval()
     try:
         for k, step, item in step_scenes(_Trainable(simulator), dict(enumerate(states)), num_steps):

@@ -227,7 +227,8 @@ def train(
     datamodule.push_forward = training.push_forward  # known only now, as it depends on the number of steps within a time budget
     interruption = Interruption()
     checkpoints = Checkpoints(run_dir / "checkpoints", 60 * trainer_settings.checkpoint_minutes, interruption)
-    steps = min(training.val_rollout_steps, datamodule.val_trajectories(1)[0].num_frames - datamodule.builder.config.history - 1)
+    shortest = min(t.num_frames for t in datamodule.val_trajectories(1))
+    steps = min(training.val_rollout_steps, shortest - datamodule.builder.config.history - 1)
     averages = [] if training.ema_decay is None else [WarmAverage(training.ema_decay)]
     own: list[Callback] = [
         RolloutValidation(datamodule.val_trajectories(training.num_val_rollouts), steps, training.val_containment),

@@ -92,6 +92,11 @@ def further_parameters() -> Scene:
     return GraphBuilder(build.config, replace(build.metadata, param_names=names)), replace(s, material_params=params, param_names=names)
 
 
+def at_another_scale(use: str, **config: Any) -> Scene:
+    build, s = particles(scales=use, **config)
+    return build.at(0.8 * scenes.SPACING, 0.007), s
+
+
 def lattice() -> Scene:
     """Return nodes with neighbours exactly at the radius."""
     build, s = particles(num_nodes=100)
@@ -134,6 +139,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "cells of two materials and sand": lambda: cells("lattice", ("sand", "elastomer", "solid")),
     "cells without shapes": lambda: cells("triangles", shapes=False),
     "further parameters": further_parameters,
+    "another scale": lambda: at_another_scale("dimensionless"),
+    "another scale without features": lambda: at_another_scale("dimensional"),
+    "another scale in a paper graph": lambda: at_another_scale("dimensionless", features="paper"),
     "ties": lattice,
     "scattered": scattered,
 }

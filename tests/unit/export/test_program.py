@@ -82,6 +82,11 @@ def test_particles(model: Any, features: str, dim: int) -> None:
     assert_same_step(ExportedStep(learned), learned, scenes.state(materials=("sand", "snow"), history=3, dim=dim).to_torch())
 
 
+def test_a_program_has_the_scale_of_the_copy_that_is_exported() -> None:
+    learned = simulator(GPE, ("sand",), 2, {"history": 3, "scales": "dimensionless"}).at(0.8 * scenes.SPACING, 0.007)
+    assert_same_step(ExportedStep(learned), learned, scenes.state(materials=("sand",), history=3).to_torch())
+
+
 @pytest.mark.parametrize("kind", ["triangles", "lattice", "tetrahedra"])
 @pytest.mark.parametrize("model", [GPE, GNS, DPINet])
 def test_meshes(model: Any, kind: Any) -> None:

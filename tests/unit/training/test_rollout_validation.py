@@ -27,6 +27,7 @@ def logged(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, float]]:
         monkeypatch.setattr(callbacks, "rollouts", lambda *_: predictions)
         found: dict[str, float] = {}
         simulator = Mock(spec=LearnedSimulator, builder=SimpleNamespace(config=SimpleNamespace(history=1)), training=True)
+        simulator.on.return_value = simulator
         simulator.initial_state = lambda trajectory, history: trajectory.state(history, history)
         module = Mock(spec=L.LightningModule, simulator=simulator, log=lambda name, value, **_: found.update({name: value}))
         RolloutValidation(truths, FRAMES, containment=False).on_validation_epoch_end(Mock(spec=L.Trainer, sanity_checking=False), module)

@@ -1,0 +1,93 @@
+"""Lines of a sweep's table that compare models of several scales with models of one, at each spacing and frame interval (``experiment=scales``)."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+
+from gpe_pl.evaluation.horizons import FULL, time_of
+from gpe_pl.evaluation.metric_rows import LEARNED
+from gpe_pl.files.markdown import table_row
+from gpe_pl.metrics import bootstrap_ratio
+from gpe_pl.reports.finished_runs import Run, rollout_errors, shared_table, shared_trajectories, values_by_seed
+
+SCALES_MD = "scales.md"
+"""Name of the file that holds only these lines."""
+USE, SPECIALIST = "graph.scales", "one"
+COMPARED = {"dimensionless": "several scales", "dimensional": "without features"}
+"""Values of ``USE`` of the models that are compared with specialists, and their names in the table."""
+SPACING, STRIDE, FRAME = "evaluation.data.spacing_factor", "evaluation.data.stride", "data.solver.frame_dt"
+NOTE = (
+    "Ratios of rollout MSE to that of a model that was trained on this spacing and frame interval alone, with as many steps: ratio of the means over scenes, "
+    "95 % bootstrap interval over paired scenes. A rollout that had to be stopped counts as ballistic flight in the same scene. Failed: rollouts that stopped, "
+    "of the specialist and of the compared models. In training: whether the models of several scales were trained on this spacing and on this frame interval."
+)
+
+Cell = tuple[float, float]
+"""Spacing [m] and frame interval [s]."""
+
+
+def scale_lines(runs: list[Run]) -> list[str]:
+    """Return a Markdown table with one line for each spacing and frame interval; empty if no run was trained on several scales."""
+    cells: dict[Cell, dict[str, list[Run]]] = defaultdict(lambda: defaultdict(list))
+    spacings = {
+        run.config[SPACING]: run.config["data.scene.grid_spacing"]
+        for run in runs
+        if run.config.get(USE) == SPECIALIST and SPACING in run.config
+    }
+    for run in runs:
+        if run.config.get(SPACING) in spacings:
+            cells[spacings[run.config[SPACING]], run.config[STRIDE] * run.config[FRAME]][run.config.get(USE, SPECIALIST)].append(run)
+    present = [use for use in COMPARED if any(use in own for own in cells.values())]
+    if not present:
+        return []
+    instants = _shared_instants(runs)
+    header = ["spacing [mm]", "frame [ms]", "in training", f"specialist at {instants[-1]} [1e-3 m²]"]
+    header += [f"{COMPARED[use]} at {instant}" for use in present for instant in instants] + ["failed"]
+    lines = [table_row(header), "|" + "---|" * len(header)]
+    for (spacing, frame), own in sorted(cells.items()):
+        lines.append(table_row([f"{1e3 * spacing:.4g}", f"{1e3 * frame:.4g}", *_line(own, present, instants)]))
+    return [*lines, "", NOTE]
+
+
+def _line(own: dict[str, list[Run]], present: list[str], instants: list[str]) -> list[str]:
+    special = own.get(SPECIALIST, [])
+    compared = [run for use in present for run in own.get(use, [])]
+    trained = _trained(compared[0]) if compared else "–"
+    error = shared_table(rollout_errors(special, "test", instants[-1]))
+    shown = [trained, f"{1e3 * error.mean():.3g}" if error.size else "not measured"]
+    shown += [_ratio(own.get(use, []), special, instant) for use in present for instant in instants]
+    return [*shown, " / ".join(_failed(own.get(use, [])) for use in (SPECIALIST, *present))]
+
+
+def _trained(run: Run) -> str:
+    """Tell whether the spacing and the stride of an evaluation are among those of the training."""
+    known = [
+        run.config[key] in _numbers(run.config[axis])
+        for key, axis in ((SPACING, "data.scales.spacing_factors"), (STRIDE, "data.scales.strides"))
+    ]
+    return {(True, True): "both", (True, False): "spacing", (False, True): "frame"}.get((known[0], known[1]), "neither")
+
+
+def _numbers(listed: str) -> list[float]:
+    return [float(part) for part in listed.strip("[]").split(",")]
+
+
+def _shared_instants(runs: list[Run]) -> list[str]:
+    found = [{*run.rows[run.rows["metric"] == "rollout_mse"]["horizon"]} for run in runs]
+    return sorted(set.intersection(*found) - {FULL}, key=time_of)
+
+
+def _ratio(runs: list[Run], reference: list[Run], instant: str) -> str:
+    own, other = (rollout_errors(some, "test", instant) for some in (runs, reference))
+    if not own or not other:
+        return "not measured"
+    scenes = shared_trajectories(own, other)
+    ratio = bootstrap_ratio(shared_table(own, scenes), shared_table(other, scenes), np.mean)
+    return f"{ratio.estimate:.2f} [{ratio.low:.2f}, {ratio.high:.2f}]"
+
+
+def _failed(runs: list[Run]) -> str:
+    ends = [value for seed in values_by_seed(runs, LEARNED, "test", "rollout_mse", FULL) for value in seed.values()]
+    return str(int(np.sum(~np.isfinite(ends))))

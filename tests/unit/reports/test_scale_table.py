@@ -1,0 +1,76 @@
+"""Models of several scales are compared with specialists at each spacing and frame interval."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
+from gpe_pl.files import sealed
+from gpe_pl.reports import sweep_table
+from gpe_pl.reports.finished_runs import finished_runs
+
+SCENES = 3
+
+
+def write_run(folder: Path, use: str, factor: float, stride: int, error: float, failed: bool = False) -> None:
+    """Write a run whose error grows from scene to scene; a failed rollout counts as ballistic flight, whose error is 1."""
+    folder.mkdir(parents=True)
+    several = use != "one"
+    data = {
+        "name": f"sand_{1.0 if several else factor}",
+        "stride": 1 if several else stride,
+        "scene": {"grid_spacing": 0.02 * (1.0 if several else factor)},
+        "solver": {"frame_dt": 0.005},
+        "scales": {"spacing_factors": [0.5, 2.0], "strides": [1, 4]} if several else None,
+    }
+    config = {
+        "seed": 0,
+        "data": data,
+        "graph": {"scales": use},
+        "model": {"_target_": "gpe_pl.models.gpe.GPE"},
+        "training": {"num_steps": 10},
+        "evaluation": {"data": {"spacing_factor": factor, "stride": stride}},
+    }
+    sealed.write(folder / "config.json", config)
+    rows = []
+    for k in range(SCENES):
+        for horizon in ("0.1s", "full"):
+            value = float("inf") if failed and k == 0 else error * (k + 1)
+            rows.append(Row(LEARNED, "test", k, "seen", 20.0, "rollout_mse", horizon, value))
+            rows.append(Row("ballistic", "test", k, "seen", 20.0, "rollout_mse", horizon, 1.0))
+    write_rows(folder / "metrics.csv", rows)
+
+
+def test_each_scale_has_a_line_with_ratios_to_its_specialist(tmp_path: Path) -> None:
+    for factor in (0.5, 1.0):
+        for stride in (1, 2):
+            write_run(tmp_path / f"one {factor} {stride}", "one", factor, stride, 1e-3)
+            write_run(tmp_path / f"told {factor} {stride}", "dimensionless", factor, stride, 1.25e-3)
+            write_run(tmp_path / f"not {factor} {stride}", "dimensional", factor, stride, 4e-3, failed=factor == stride == 1)
+    sweep_table.report_sweep(tmp_path, finished_runs(tmp_path))
+    lines = (tmp_path / "scales.md").read_text().splitlines()
+    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[:6] if "---" not in line]
+    assert table[0][:4] == ["spacing [mm]", "frame [ms]", "in training", "specialist at 0.1s [1e-3 m²]"]
+    assert table[0][4:] == ["several scales at 0.1s", "without features at 0.1s", "failed"]
+    told, without = "1.25 [1.25, 1.25]", "4.00 [4.00, 4.00]"
+    assert table[1] == ["10", "5", "both", "2", told, without, "0 / 0 / 0"]
+    assert table[2] == ["10", "10", "spacing", "2", told, without, "0 / 0 / 0"]
+    assert table[3][:5] == ["20", "5", "frame", "2", told] and table[3][6] == "0 / 0 / 1"
+    assert float(table[3][5].split()[0]) > 100  # one rollout counts as free flight
+    assert table[4][:5] == ["20", "10", "neither", "2", told]
+    assert "\n".join(lines) in (tmp_path / "table.md").read_text()
+
+
+def test_a_scale_without_a_specialist_is_not_compared(tmp_path: Path) -> None:
+    write_run(tmp_path / "one", "one", 0.5, 1, 1e-3)
+    for stride in (1, 2):
+        write_run(tmp_path / f"told {stride}", "dimensionless", 0.5, stride, 1e-3)
+    sweep_table.report_sweep(tmp_path, finished_runs(tmp_path))
+    assert "| 10 | 10 | spacing | not measured | not measured |" in (tmp_path / "scales.md").read_text()
+
+
+def test_other_sweeps_have_no_such_table(tmp_path: Path) -> None:
+    for stride in (1, 2):
+        write_run(tmp_path / str(stride), "one", 1.0, stride, 1e-3)
+    sweep_table.report_sweep(tmp_path, finished_runs(tmp_path))
+    assert not (tmp_path / "scales.md").exists()
