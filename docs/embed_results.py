@@ -42,6 +42,7 @@ PICTURES = (
     *("rollout_test_00.png", "rollout_test_unseen_00.png", "stress_test_unseen_00.png", "error_curve_test.png"),
     *("long_horizon_*.png", "perturbation_*.png", "cost_error_*.png"),
     "engines.png",
+    "bands.png",
     *("acceptance_fem_beam.png", "acceptance_elastomer_square.png", "acceptance_sand_column.png"),
     "scenes/*_00_misfit.png",
     *("acceptance_snow_cylinder.png", "acceptance_fluid_dam_break.png", "acceptance_sand_slump.png"),
