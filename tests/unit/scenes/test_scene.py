@@ -213,7 +213,7 @@ def test_examples_of_the_guide_are_scenes(tmp_path: Path, monkeypatch: pytest.Mo
     pytest.importorskip("trimesh")
     monkeypatch.chdir(tmp_path)
     cube(Path("part.stl"))
-    guide, readme = (ROOT / "docs" / "guide" / "scenes.md").read_text(), (ROOT / "README.md").read_text()
+    guide, *others = ((ROOT / page).read_text() for page in ("docs/guide/scenes.md", "docs/guide/open_scenes.md", "README.md"))
     for text in (
         *re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL),
         predict.ABOUT[predict.ABOUT.index("  box:") :].replace("\n  ", "\n").strip(),
@@ -233,7 +233,7 @@ def test_examples_of_the_guide_are_scenes(tmp_path: Path, monkeypatch: pytest.Mo
             return Path()
 
     monkeypatch.setattr(Scene, "_film", lambda scene, *_, **__: Seen(scene))
-    for page in (guide, readme):
+    for page in (guide, *others):
         names: dict[str, Any] = {}
         for code in (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Scene(" in block):
             exec(code, names)
