@@ -167,6 +167,7 @@ class GPE(Model):
         wall_distance: with ``elastic``, initial value of the learned distance from walls at which nodes stop, in rest spacings.
         only_contacts: with ``elastic`` and the ``contact`` decoder, the network adds forces between bodies, and between bodies and walls, and nothing within
             bodies.
+        viscous: with ``elastic``, cells also have a viscous stress with a learned constant. Choose false for data of solids without damping.
         island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or
             ``ignored``.
 
@@ -194,6 +195,7 @@ class GPE(Model):
         elastic: bool = False,
         wall_distance: Annotated[float, Field(ge=0)] = 0.0,
         only_contacts: bool = False,
+        viscous: bool = True,
     ) -> None:
         super().__init__(
             spec,
@@ -211,6 +213,7 @@ class GPE(Model):
             elastic=elastic,
             wall_distance=wall_distance,
             only_contacts=only_contacts,
+            viscous=viscous,
         )
         if elastic and not (spec.cells and spec.meshes and spec.islands):
             raise CellError(
@@ -276,7 +279,7 @@ class GPE(Model):
             self.pair_decoder = nn.ModuleDict({self.key(r): PairForce(spec, r, hidden) for r in forces})
         if elastic:
             self.elastic_bodies = ElasticBodies(
-                {m: spec.param_channels[m] if m in read else 0 for m in spec.meshes}, spec.dim, wall_distance
+                {m: spec.param_channels[m] if m in read else 0 for m in spec.meshes}, spec.dim, wall_distance, viscous
             )
             zeroed = [cast(MLP, self.node_decoder[m])[2] for m in spec.meshes] if decoder != "pair" else []
             zeroed += [cast(PairForce, force).lin_out for force in self.pair_decoder.values()] if decoder == "pair" or self.bodies else []

@@ -54,16 +54,17 @@ class ElasticBodies(nn.Module):
         param_channels: number of parameters per material with cells; 0 leaves the parameters out.
         dim: dimension of space.
         wall_distance: distance at which walls act before training, in rest spacings.
+        viscous: cells have a viscous stress, whose constant is learned; otherwise it is negligible.
     """
 
     acceleration_unit: Tensor
     spacing: Tensor
     stress_unit: Tensor
 
-    def __init__(self, param_channels: dict[str, int], dim: int, wall_distance: float = 0.0) -> None:
+    def __init__(self, param_channels: dict[str, int], dim: int, wall_distance: float = 0.0, viscous: bool = True) -> None:
         super().__init__()
         self.dim = dim
-        self.constants = nn.ModuleDict({m: Constants(count) for m, count in param_channels.items()})
+        self.constants = nn.ModuleDict({m: Constants(count, viscous) for m, count in param_channels.items()})
         self.log_friction = nn.ParameterDict({m: torch.zeros(()) for m in param_channels})
         self.wall_distance = nn.ParameterDict({m: torch.tensor(float(wall_distance)) for m in param_channels})
         self.register_buffer("acceleration_unit", torch.ones((), dtype=torch.float64))

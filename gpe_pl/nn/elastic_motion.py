@@ -41,6 +41,8 @@ LOGARITHM_SCALE = 5.0
 """The logarithms of constants are this factor times their weights, so that training finds the constants within some hundred steps."""
 FIRST_GUESS = (10.0, 10.0, 0.1)
 """λ, μ and η before training, in units of density × (spacing/frame)²: waves cross a few cells in a frame."""
+NEGLIGIBLE = 1e-8
+"""η of cells that are not viscous, in the same unit."""
 
 
 @dataclass(frozen=True)
@@ -427,16 +429,25 @@ class _Motion(torch.autograd.Function):
 
 
 class Constants(nn.Module):
-    """Learned constants λ, μ and η of a material. Their logarithms are affine in the standardised material parameters."""
+    """Learned constants λ, μ and η of a material. Their logarithms are affine in the standardised material parameters.
 
-    def __init__(self, param_channels: int) -> None:
+    Args:
+        param_channels: number of material parameters.
+        viscous: learn η; otherwise it stays ``NEGLIGIBLE``.
+    """
+
+    def __init__(self, param_channels: int, viscous: bool = True) -> None:
         super().__init__()
+        guess = torch.tensor(FIRST_GUESS if viscous else (*FIRST_GUESS[:2], NEGLIGIBLE))
+        self.num_learned = 3 if viscous else 2
         self.logarithm = nn.ParameterDict(  # nn.Linear warns if there are no parameters
-            {"weight": torch.zeros(3, param_channels), "bias": torch.tensor(FIRST_GUESS).log() / LOGARITHM_SCALE}
+            {"weight": torch.zeros(3, param_channels), "bias": guess.log() / LOGARITHM_SCALE}
         )
 
     def forward(self, params: Float[Tensor, "node param"]) -> tuple[Float[Tensor, " node"], Float[Tensor, " node"], Float[Tensor, " node"]]:
         """Return λ, μ and η, each from e⁻²⁰ to e²⁰."""
-        logarithm = nn.functional.linear(params, self.logarithm["weight"], self.logarithm["bias"])
-        lam, mu, eta = (LOGARITHM_SCALE * logarithm).clamp(-20.0, 20.0).exp().unbind(dim=1)
+        weight, bias = (
+            torch.cat([t[: self.num_learned], t[self.num_learned :].detach()]) for t in (self.logarithm["weight"], self.logarithm["bias"])
+        )
+        lam, mu, eta = (LOGARITHM_SCALE * nn.functional.linear(params, weight, bias)).clamp(-20.0, 20.0).exp().unbind(dim=1)
         return lam, mu, eta

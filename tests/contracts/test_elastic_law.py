@@ -65,3 +65,13 @@ def test_constants_are_recovered_at_two_moduli() -> None:
         assert (lam, mu) == pytest.approx(expected, rel=0.2)  # the solver's integration in time is another one
     ratios = [stiff / soft for stiff, soft in zip(found[STIFF], found[SOFT], strict=True)]
     assert ratios == pytest.approx([STIFF / SOFT] * 2, rel=0.1), ratios
+
+
+def test_without_viscosity_its_constant_stays_negligible() -> None:
+    constants = Constants(1, viscous=False)
+    lam, mu, eta = constants(torch.tensor([[2.0]]))
+    (lam + mu + eta).sum().backward()  # type: ignore[no-untyped-call]
+    assert eta.item() < 1e-7 < lam.item()
+    for values in constants.logarithm.values():
+        assert values.grad is not None and values.grad[:2].all() and not values.grad[2].any()
+    assert Constants(1)(torch.zeros(1, 1))[2].item() == pytest.approx(0.1)
