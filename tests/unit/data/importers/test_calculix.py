@@ -16,9 +16,11 @@ import pytest
 import torch
 
 from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset
+from gpe_pl.fit import fit
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics.quantities import quantities
 from gpe_pl.metrics.rollouts import rollout_metrics
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.elastic_motion import LOGARITHM_SCALE
@@ -26,6 +28,7 @@ from gpe_pl.rollout.loop import rollout
 from gpe_pl.trajectory.store import iter_trajectories
 from gpe_pl.trajectory.strain import lame_parameters
 from gpe_pl.trajectory.trajectory import Trajectory
+from tests.runs import compose
 
 SIZE, DT, FRAMES = 0.1, 0.01, 6
 POINTS = SIZE * np.argwhere(np.ones((3, 2, 2)))
@@ -242,3 +245,40 @@ def test_the_elastic_law_with_true_constants_follows_calculix(tmp_path: Path, ca
     errors = {r.metric: r.value for r in rollout_metrics(found, truth.frames(1), ["full"])}
     assert found.termination is None and errors["displacement_error"] < 0.1
     assert np.abs(truth.pos - truth.pos[0]).max() > 0.1 * m.spacing
+
+
+SMALL = {"cantilever": {"cells": (8, 2, 2), "num_frames": 40}, "plate": {"cells": (6, 6, 1), "size": 0.03, "num_frames": 30}}
+
+
+@needs_ccx
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SMALL)
+def test_a_short_training_answers_what_calculix_does(tmp_path: Path, case: str) -> None:
+    """Deflection within 10 % and peak stress within 25 % of their largest values in the mean over time, in a scene with an unseen modulus and load."""
+    made = decks()
+    small = replace(made.CASES[case], **SMALL[case])
+    for split, factors in {"train": [(0.6, 1.0), (1.0, 1.3), (1.7, 0.8)], "val": [(0.8, 1.0)], "test": [(1.25, 0.9)]}.items():
+        (tmp_path / "raw" / split).mkdir(parents=True)
+        for k, (stiffer, stronger) in enumerate(factors):
+            path = tmp_path / "raw" / split / f"{k}.inp"
+            path.write_text(made.deck(replace(small, modulus=small.modulus * stiffer, load=small.load * stronger)))
+            made.run(path)
+    import_dataset(tmp_path / "data", ImportSettings("calculix", str(tmp_path / "raw"), "set", materials={1: "elastomer"}))
+    law = ("law=elastic", "model=gpe_tuned", "model.only_contacts=true", "model.viscous=false", "model.stress=true", "graph.history=1")
+    steps = (
+        "training.num_steps=200",
+        "training.learning_rate=8e-3",
+        "training.warmup_steps=20",
+        "training.val_interval=100",
+        "size.hidden_channels=8",
+        "evaluation.num_pictures=0",
+    )
+    folders = (f"paths.data={tmp_path / 'data'}", f"paths.runs={tmp_path / 'runs'}")
+    fit(compose("fit", "data=imported", "data.name=set", *law, *steps, "trainer.progress=false", "trainer.num_threads=1", *folders))
+    simulator = LearnedSimulator.from_checkpoint(tmp_path / "runs" / "fit")
+    truth = next(iter_trajectories(tmp_path / "data" / "set" / "imported", "test"))
+    found = rollout(simulator, simulator.initial_state(truth, 1), truth.num_frames - 2, truth.metadata)
+    own, expected = quantities(found), quantities(truth.frames(1))
+    for name, limit in (("deflection", 0.1), ("peak stress", 0.25)):
+        a, b = own[name].over_time, expected[name].over_time
+        assert np.sqrt(np.mean((a - b) ** 2)) / b.max() < limit, name
