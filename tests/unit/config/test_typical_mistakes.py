@@ -42,7 +42,7 @@ MISTAKES = [
     ("fit seed=[0", "seed=[0: cannot be read; write lists as 'seed=[A,B]'"),
     # misspelt keys and choices
     ("fit dta=sand", "dta: unknown key 'dta'; did you mean 'data'?; valid keys: "),
-    ("fit data=sadn", "data=sadn: no such choice; did you mean 'sand'?; choices: elastomer, "),
+    ("fit data=sadn", "data=sadn: no such choice; did you mean 'sand'?; choices: "),
     ("fit model=GPE", "model=GPE: no such choice; did you mean 'gpe'?"),
     ("fit size=medium", "size=medium: no such choice; choices: paper, small, tiny"),
     ("fit num_steps=100", "num_steps: unknown key 'num_steps'; did you mean 'training.num_steps'?"),
