@@ -44,8 +44,11 @@ class Film:
     others: Mapping[str, Trajectory]
 
     def summary(self) -> str:
-        """Return one line per rollout: its length, its error if the first rollout is ground truth, and why it stopped if it stopped early."""
-        lines = [describe(self.first)]
+        """Return one line per inlet, outlet and rollout.
+
+        Lines of rollouts have the length, the error if the first rollout is ground truth, and why a rollout stopped if it stopped early.
+        """
+        lines = [describe(self.first), *map(str, self.first.openings)]
         for name, rollout in with_heading(self.first, self.others).items():
             line = f"{name}: {(rollout.num_frames - 1) * rollout.metadata.frame_dt:.3g} s in {rollout.num_frames - 1} frames, {rollout.num_nodes} nodes"
             if rollout.alive is not None:

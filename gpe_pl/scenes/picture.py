@@ -51,7 +51,7 @@ def draw(scene: Scene, faults: Mapping[str, str], path: Path) -> None:
         (left, bottom), (right, top) = zone.low[[across, up]], zone.high[[across, up]]
         color = WRONG if zone.name in faults else "0.4"
         axes.plot([left, right, right, left, left], [bottom, bottom, top, top, bottom], "--", color=color)
-        axes.annotate(zone.name, ((left + right) / 2, top), ha="center", fontsize=8, bbox=LABEL)
+        axes.annotate(f"{zone.name}\n{zone.opening}", ((left + right) / 2, top), ha="center", fontsize=8, bbox=LABEL)
     low, high = bounds[[across, up]].T
     axes.plot([low[0], high[0], high[0], low[0], low[0]], [low[1], low[1], high[1], high[1], low[1]], color="black")
     axes.set_aspect("equal")

@@ -81,6 +81,17 @@ class Opening:
         """Whether it prescribes the motion of its nodes."""
         return self.speed is not None or bool(self.speeds)
 
+    def __str__(self) -> str:
+        """Return which way nodes go and at which speeds, such as ``in and out through x_low at -1 to 1 m/s``."""
+        if not self.drives:
+            return f"out through {self.side}"
+        speeds = [self.speed_at(0.0), *(speed for _, speed in self.speeds)]
+        low, high = min(speeds), max(speeds)
+        way = "in" if low >= 0 else "out" if high <= 0 else "in and out"
+        if way == "out":
+            low, high = abs(high), abs(low)
+        return f"{way} through {self.side} at {f'{low:g}' if low == high else f'{low:g} to {high:g}'} m/s"
+
     def speed_at(self, time: float) -> float:
         """Return the speed [m/s] at a time since the start of the scene [s]; 0 if it prescribes none."""
         if not self.speeds:
