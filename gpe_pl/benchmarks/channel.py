@@ -222,7 +222,9 @@ def report(records: list[dict[str, Any]]) -> str:
             found = ["–"] * 6 if own["level"] is None else _cells(own, outflow, depth, own["simulator"] == SOLVER)
             about += ["yes" if own["has_sill"] else "no", own["simulator"], str(own["frames"])]
             lines.append(table_row([*about, *found, str(own["unaccounted"])]))
-            worst.setdefault(own["simulator"], []).append((abs(outflow), abs(depth), abs(own["drift"] or 0.0)))
+            worst.setdefault(own["simulator"], []).append(
+                (abs(outflow), abs(depth), math.inf if own["drift"] is None else abs(own["drift"]))
+            )
     lines += [
         "",
         table_row(

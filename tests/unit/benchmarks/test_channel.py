@@ -68,11 +68,14 @@ def test_tables_have_errors_relative_to_the_solver(flow: Trajectory) -> None:
     }
     true = measured(flow, 80)
     wrong = {**true, "leaves": 0.97 * true["leaves"], "level": 1.2 * true["level"]}
-    records = [{**about, "simulator": name, **own} for name, own in ((SOLVER, true), ("good", true), ("deep", wrong))]
+    stopped = measured(replace(flow.frames(0, 9), termination=Termination("nan", 9, 0, "")), 80)
+    rollouts = ((SOLVER, true), ("good", true), ("deep", wrong), ("stopped", stopped))
+    records = [{**about, "simulator": name, **own} for name, own in rollouts]
     table = report(records)
     assert "| deep | 80 | 60 | 58.2 | -3.0 % | 0.351 | +20.0 % |" in table
     assert "| good | 1 | 1 of 1 | 0.0 % | 0.0 % | 0.0 % | 0.0 % |" in table
     assert "| deep | 1 | 0 of 1 | 3.0 % | 3.0 % | 20.0 % | 20.0 % |" in table
+    assert "| stopped | 1 | 0 of 1 | – | – | – | – | – |" in table
     assert figures(records).keys() == {"channel"}
 
 
