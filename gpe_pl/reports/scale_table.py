@@ -1,19 +1,21 @@
-"""Lines of a sweep's table that compare models of several scales with models of one, at each spacing and frame interval (``experiment=scales``)."""
+"""Table that compares models of several scales with models of one, at each spacing and frame interval (``experiment=scales``)."""
 
 from __future__ import annotations
 
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 
 from gpe_pl.evaluation.horizons import FULL, time_of
 from gpe_pl.evaluation.metric_rows import LEARNED
+from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import bootstrap_ratio
-from gpe_pl.reports.finished_runs import Run, rollout_errors, shared_table, shared_trajectories, values_by_seed
+from gpe_pl.reports.finished_runs import Run, distinct_runs, rollout_errors, shared_table, shared_trajectories, values_by_seed
 
 SCALES_MD = "scales.md"
-"""Name of the file that holds only these lines."""
+"""Name of the file."""
 USE, SPECIALIST = "graph.scales", "one"
 COMPARED = {"dimensionless": "several scales", "dimensional": "without features"}
 """Values of ``USE`` of the models that are compared with specialists, and their names in the table."""
@@ -28,8 +30,18 @@ Cell = tuple[float, float]
 """Spacing [m] and frame interval [s]."""
 
 
+def compares_scales(runs: list[Run]) -> bool:
+    """Tell whether some of the runs were trained on several scales, and evaluated on data that ``evaluation.data`` names."""
+    return any(run.config.get(USE) in COMPARED and SPACING in run.config for run in runs)
+
+
+def report_scales(folder: Path, runs: list[Run]) -> None:
+    """Write ``scales.md`` into a folder."""
+    replace_text(folder / SCALES_MD, "\n".join([*scale_lines(distinct_runs(runs)), ""]))
+
+
 def scale_lines(runs: list[Run]) -> list[str]:
-    """Return a Markdown table with one line for each spacing and frame interval; empty if no run was trained on several scales."""
+    """Return a Markdown table with one line for each spacing and frame interval."""
     cells: dict[Cell, dict[str, list[Run]]] = defaultdict(lambda: defaultdict(list))
     spacings = {
         run.config[SPACING]: run.config["data.scene.grid_spacing"]
@@ -40,8 +52,6 @@ def scale_lines(runs: list[Run]) -> list[str]:
         if run.config.get(SPACING) in spacings:
             cells[spacings[run.config[SPACING]], run.config[STRIDE] * run.config[FRAME]][run.config.get(USE, SPECIALIST)].append(run)
     present = [use for use in COMPARED if any(use in own for own in cells.values())]
-    if not present:
-        return []
     instants = _shared_instants(runs)
     header = ["spacing [mm]", "frame [ms]", "in training", f"specialist at {instants[-1]} [1e-3 m²]"]
     header += [f"{COMPARED[use]} at {instant}" for use in present for instant in instants] + ["failed"]

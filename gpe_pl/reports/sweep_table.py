@@ -38,7 +38,6 @@ from gpe_pl.reports.finished_runs import (
 from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, verdict, write_material_figure
 from gpe_pl.reports.outcome import outcomes
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
-from gpe_pl.reports.scale_table import SCALES_MD, scale_lines
 from gpe_pl.reports.stride_table import STRIDES_MD, stride_lines
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.viz.saving import save_figure
@@ -105,7 +104,7 @@ def variants_of(runs: list[Run]) -> tuple[list[str], dict[Variant, list[Run]]]:
 
 
 def _report(folder: Path, runs: list[Run]) -> None:
-    """Write ``table.csv``, ``table.md``, ``scales.md`` if models of several scales are compared, ``strides.md`` if strides are, and these figures.
+    """Write ``table.csv``, ``table.md``, ``strides.md`` if variants differ in their stride, and these figures.
 
     - ``validation_loss.png``, if every variant has a validation curve.
     - ``reads_material.png``, if a variant has controls of the material.
@@ -117,9 +116,7 @@ def _report(folder: Path, runs: list[Run]) -> None:
     _write_csv(folder / "table.csv", axes, runs)
     ratios = forward_time_ratios(folder, variants)
     replace_text(folder / SWEEP_MD, _markdown(axes, variants, ratios))
-    if scales := scale_lines(runs):
-        replace_text(folder / SCALES_MD, "\n".join([*scales, ""]))
-    elif strides := stride_lines(axes, variants):
+    if strides := stride_lines(axes, variants):
         replace_text(folder / STRIDES_MD, "\n".join([*strides, ""]))
     curves = {", ".join(v) or LEARNED: [validation_curve(r) for r in members] for v, members in variants.items()}
     curves = {k: [c for c in v if len(c[0])] for k, v in curves.items()}
@@ -229,15 +226,11 @@ def _markdown(axes: list[str], variants: dict[Variant, list[Run]], ratios: dict[
             *_stress_table(names, variants),
             *_metric_table(names, variants, BODY_COLUMNS, BODY_NOTE),
             *_metric_table(names, variants, LIQUID_COLUMNS, LIQUID_NOTE),
-            *(["", *lines] if (lines := _of_scales(axes, variants)) else []),
+            *(["", *strides] if (strides := stride_lines(axes, variants)) else []),
             *(["", *lines] if (lines := material_lines(_material_groups(variants))) else []),
             "",
         ]
     )
-
-
-def _of_scales(axes: list[str], variants: dict[Variant, list[Run]]) -> list[str]:
-    return scale_lines([run for runs in variants.values() for run in runs]) or stride_lines(axes, variants)
 
 
 def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios: dict[Variant, float]) -> list[str]:

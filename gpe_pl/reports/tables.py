@@ -15,6 +15,7 @@ from gpe_pl.files.run_folder import RunError
 from gpe_pl.reports.domain_table import TABLE_MD, compares_models, report_domains
 from gpe_pl.reports.evaluation_table import EVALUATIONS_MD, report_evaluations
 from gpe_pl.reports.finished_runs import Run, evaluations_below, finished_runs, is_evaluation
+from gpe_pl.reports.scale_table import SCALES_MD, compares_scales, report_scales
 from gpe_pl.reports.sweep_table import SWEEP_MD, report_sweep
 from gpe_pl.reports.trial_table import TRIALS_MD, compares_settings, report_trials
 from gpe_pl.system.locks import locked
@@ -32,6 +33,9 @@ def write_tables(folder: Path, runs: list[Run]) -> Path:
     if runs and all(map(is_evaluation, runs)):
         report_evaluations(folder, runs)
         return folder / EVALUATIONS_MD
+    if compares_scales(runs):
+        report_scales(folder, runs)
+        return folder / SCALES_MD
     if compares_settings(runs):
         report_trials(folder, runs)
         return folder / TRIALS_MD
