@@ -20,6 +20,14 @@ NORMAL_90 = 1.645
 """Half-width of the central 90 % of a normal distribution, in standard deviations: intervals without a calibration."""
 
 
+FLOOR = 3.0
+"""Floor of the scales, in medians of the calibration scenes. Scenes with a small scale have no smaller errors.
+
+With a floor of 1, interval scores of 20 scenes of sand and 17 of elastomers were 1.5 and 1.7 times as large. Scenes with a scale far above the median still get
+wide intervals.
+"""
+
+
 class FewScenesError(GpeError, ValueError):
     """Raised when calibration scenes are too few."""
 
@@ -39,7 +47,7 @@ class Calibration:
     Attributes:
         offset, slope: the corrected answer is ``offset + slope · estimate``.
         factor: half-width of the interval, in units of ``|slope| · √(scale² + floor²)``.
-        floor: median scale of the calibration scenes. It keeps intervals from becoming very narrow where one scene's scale is small by chance.
+        floor: ``FLOOR`` times the median scale of the calibration scenes. It keeps intervals from becoming narrow where one scene's scale is small by chance.
         num_scenes: number of calibration scenes; 0 if there was no calibration.
         level: nominal coverage.
     """
@@ -82,7 +90,7 @@ def calibrated(pairs: Pairs, level: float = 0.9, adapts: bool = True) -> Calibra
         raise FewScenesError(
             f"{number} calibration scenes; intervals of {100 * level:g} % need at least {least}: identify more scenes with known values"
         )
-    floor = float(np.median(pairs.scale)) if adapts else 0.0
+    floor = FLOOR * float(np.median(pairs.scale)) if adapts else 0.0
     scale = np.hypot(pairs.scale, floor) if adapts else np.ones(number)
     weight = scale**-2 / (scale**-2).sum()
     slope, offset = np.polyfit(pairs.estimate, pairs.truth, 1, w=1 / scale)

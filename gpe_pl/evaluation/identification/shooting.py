@@ -8,7 +8,7 @@ Windows start from observed states, so errors do not grow over the whole motion.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -73,7 +73,6 @@ class Shooting:
     block: int
     num_evaluations: int = 0
     num_gradients: int = 0
-    _targets: dict[tuple[int, int], Any] = field(default_factory=dict)
 
     def misfit(self, z: Sequence[float] | np.ndarray) -> float:
         """Return the misfit at numbers from 0 to 1 [unknown]."""
@@ -124,18 +123,21 @@ class Shooting:
             if isinstance(item, State) and self.observations.seen[start + k].any():
                 rows, target = self._target(start, k, item.pos)
                 difference = item.periodicity.shortest(item.pos[rows] - target) / spacing
-                error = (difference**2).sum() / len(rows)
+                error = (difference**2).sum() / len(target)
                 errors[start][k - 1] = error if bool(error < FAILED) else FAILED  # also if it is NaN
         return list(errors.values())
 
     def _target(self, start: int, k: int, like: Any) -> tuple[Any, Any]:
-        """Return rows and positions of the nodes observed in frame ``k`` after a start, as arrays or tensors like ``like``."""
-        if (start, k) not in self._targets:
-            rows = np.flatnonzero(self.observations.seen[start + k])
-            target = self.observations.trajectory.pos[start + k, rows].astype(np.float64)
-            is_tensor = isinstance(like, torch.Tensor)
-            self._targets[start, k] = tuple(map(torch.from_numpy, (rows, target))) if is_tensor else (rows, target)
-        return self._targets[start, k]
+        """Return rows and positions of the nodes observed in frame ``k`` after a start, as arrays or tensors like ``like``.
+
+        Rows of all nodes are a slice, so that gradients store no numbers of nodes.
+        """
+        seen = self.observations.seen[start + k]
+        rows: Any = slice(None) if seen.all() else np.flatnonzero(seen)
+        target: Any = self.observations.trajectory.pos[start + k, rows].astype(np.float64)
+        if isinstance(like, torch.Tensor):
+            rows, target = rows if isinstance(rows, slice) else torch.from_numpy(rows), torch.from_numpy(target)
+        return rows, target
 
 
 def shooting(simulator: Simulator, observations: Observations, unknowns: Unknowns, settings: ShootingSettings | None = None) -> Shooting:

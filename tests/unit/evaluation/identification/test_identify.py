@@ -267,6 +267,15 @@ def biased(number: int, seed: int) -> Pairs:
     return Pairs(0.8 * truth - 3 + scale * rng.normal(size=number), truth, scale)
 
 
+def test_a_small_scale_does_not_make_an_interval_narrow() -> None:
+    """A large one makes it wide."""
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=40)
+    found = calibrated(Pairs(truth + 0.1 * rng.normal(size=40), truth, np.ones(40)))
+    small, median, large = (high - low for _, low, high in (found.interval(0.0, scale) for scale in (0.0, 1.0, 20.0)))
+    assert 0.9 * median < small < median < 0.2 * large
+
+
 def test_calibration_corrects_and_covers() -> None:
     known, new = calibrated(biased(200, 0)), biased(1000, 1)
     center, low, high = np.array([known.interval(e, s) for e, s in zip(new.estimate, new.scale, strict=True)]).T
