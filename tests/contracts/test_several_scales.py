@@ -232,6 +232,7 @@ def test_numbers_of_nodes_do_not_limit_batches_of_several_scales(module: Traject
         BatchSampler(module.train_set, BatchSize(2, 50), 0, lambda: 0)
 
 
+@pytest.mark.slow
 def test_a_scene_of_your_own_and_its_solver_take_the_scale_of_the_model(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     from gpe_pl.scenes.scene import Scene
 
