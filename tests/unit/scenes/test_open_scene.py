@@ -158,6 +158,7 @@ def test_a_model_predicts_what_enters_and_leaves(tmp_path: Path) -> None:
     assert rollout.num_nodes == 64 + 8 * layers
     half = rollout.num_frames // 2
     assert half == 10
+    assert "\nin through y_high at 3 m/s\nout through y_low\n" in film.summary()
     assert "152 entered, " in film.summary()
     assert f"{1600 * SPACING**2 * rollout.alive[half:].sum(axis=1).mean():.4g} kg/m are there" in film.summary()
     assert (~rollout.alive[-1, :64]).sum() > 0

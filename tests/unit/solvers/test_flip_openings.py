@@ -60,6 +60,21 @@ def test_an_outlet_with_a_speed_draws_water_out_of_a_duct() -> None:
     np.testing.assert_allclose(last.vel[drawn].mean(axis=0), [SPEED, 0.0], atol=0.03)
 
 
+def test_a_zone_in_both_directions_pushes_water_and_draws_it_back() -> None:
+    zone = replace(inlet(0.4), speed=None, speeds=((0.0, SPEED), (0.05, SPEED), (0.06, -SPEED)))
+    solver, state, metadata = duct(0.4, 1.2, 0.8, zone)
+    result = rollout(solver, state, 40, metadata)
+    assert result.alive is not None
+    speed = [result.vel[k, result.alive[k] & (result.pos[k, :, 0] > 0.2), 0].mean() for k in range(41)]
+    np.testing.assert_allclose(speed[8:10], SPEED, atol=0.03)
+    np.testing.assert_allclose(speed[20:], -SPEED, atol=0.05)
+    change = np.diff(result.alive.astype(int), axis=0)
+    net = (change == 1).sum() - (change == -1).sum()
+    assert (change == 1).sum() == 8
+    assert net == pytest.approx(8 * zone.travel(40 * DT) / SPACING, abs=8)
+    assert result.alive[-1].sum() == state.num_nodes + net
+
+
 def test_an_inlet_of_a_closed_basin_fills_it_exactly() -> None:
     solver, state, metadata = duct(0.6, 1.0, 0.2, inlet(0.2), gravity=-9.81)
     state = state.take(state.pos[:, 1] < 0.2).opened(state.openings)

@@ -14,7 +14,7 @@ from gpe_pl.data.validate import validate
 from gpe_pl.metrics.open_scenes import entering, leaving, ledger, present
 from gpe_pl.trajectory.openings import Opening, openings_fault, openings_from_json, openings_to_json
 from gpe_pl.trajectory.store import StoreError, read_trajectory, write_shard
-from tests.open_scenes import DT, GRAVITY, OPENINGS, STEADY, TURNING, open_trajectory
+from tests.open_scenes import DT, GRAVITY, OPENINGS, OUTLET, STEADY, TURNING, open_trajectory
 
 RAMP = Opening((0.0, 0.0), (0.3, 0.2), "x_low", None, 0.1, 0, 2.0, (30.0,), ((0.0, 0.0), (1.0, 1.0), (3.0, -1.0)))
 
@@ -28,6 +28,20 @@ def test_travel_is_the_integral_of_the_speed() -> None:
     assert (RAMP.speed_at(-1.0), RAMP.speed_at(9.0)) == (0.0, -1.0)
     np.testing.assert_allclose(RAMP.mean_velocity(0.0, 1.0), [0.5, 0.0])
     np.testing.assert_allclose(replace(RAMP, side="x_high").velocity_at(1.0), [-1.0, 0.0])
+
+
+def test_openings_say_what_they_do() -> None:
+    texts = [
+        str(opening)
+        for opening in (STEADY, TURNING, OUTLET, replace(OUTLET, speed=-2.0), replace(OUTLET, speeds=((0.0, -2.0), (1.0, 0.0))))
+    ]
+    assert texts == [
+        "in through x_low at 1 m/s",
+        "in and out through y_high at -0.8 to 0.8 m/s",
+        "out through y_low",
+        "out through y_low at 2 m/s",
+        "out through y_low at 0 to 2 m/s",
+    ]
 
 
 def test_layers_enter_and_leave_with_the_speed() -> None:
