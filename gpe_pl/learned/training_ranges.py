@@ -19,7 +19,7 @@ SCALE_TOLERANCE = 1e-6
 FARTHEST = 2.0
 """Factor by which spacing and frame interval of a scene may be outside their ranges in training."""
 MASS_FACTOR = 2.0
-"""Factor by which masses of nodes may leave the range of training: corners of meshes differ between bodies of one kind."""
+"""Factor by which masses of nodes may leave the range of training, because corners of meshes differ between bodies of one kind."""
 
 
 def stored_ranges(metadata: Metadata, material: str, trained: Tensor) -> Iterator[tuple[MaterialParameter, int, Tensor]]:

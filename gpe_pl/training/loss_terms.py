@@ -50,7 +50,7 @@ def stress_error(
 ) -> Float[Tensor, "node component"]:
     """Return squared errors of normalised stresses.
 
-    With ``relative``, they are divided by the mean square of the target in the node's graph plus ``LEAST_STRESS``². Their mean is then that of the squared
+    With ``relative``, they are divided by the mean square of the target in the node's graph plus the square of ``LEAST_STRESS``. Their mean is then that of the squared
     relative L2 norms of the graphs, so that small stresses count as much as large ones.
 
     Args:

@@ -32,7 +32,7 @@ MEASURED_FILE = "measured.json"
 HEADER = ["data set", "quantity", "published", "trivial baseline", "model", "splits", "seeds"]
 
 
-class TrainingError(GpeError, RuntimeError):
+class LearningSetError(GpeError, RuntimeError):
     """Raised when a training fails; the message names its command."""
 
 
@@ -62,7 +62,7 @@ def run(settings: Settings, folder: Path) -> tuple[list[dict[str, Any]], str]:
 
     Raises:
         ImportFailure: files of a data set cannot be read.
-        TrainingError: a training failed.
+        LearningSetError: a training failed.
     """
     torch.set_num_threads(settings.num_threads)
     source = Path(settings.folder).expanduser()
@@ -86,7 +86,7 @@ def _trained(name: SetName, label: str, splits: Mapping[str, Any], seed: int, so
     about = ["data=imported", f"data.name={dataset}", f"name={run_name}", f"seed={seed}", *overrides]
     paths = [f"paths.data={folder / 'data'}", f"paths.runs={folder / 'runs'}"]
     if subprocess.run([sys.executable, "-m", "gpe_pl.fit", *about, *paths], check=False).returncode:
-        raise TrainingError(f"python -m gpe_pl.fit {' '.join(about)}: failed; its messages are above")
+        raise LearningSetError(f"python -m gpe_pl.fit {' '.join(about)}: failed; its messages are above")
     checkpoint = folder / "runs" / run_name / "checkpoints" / "best.ckpt"
     digest = sha256(checkpoint.read_bytes()).hexdigest()
     stored = folder / "runs" / run_name / MEASURED_FILE
