@@ -50,8 +50,8 @@ def stress_error(
 ) -> Float[Tensor, "node component"]:
     """Return squared errors of normalised stresses.
 
-    With ``relative``, they are divided by the mean square of the target in the node's graph plus the square of ``LEAST_STRESS``. Their mean is then that of the squared
-    relative L2 norms of the graphs, so that small stresses count as much as large ones.
+    With ``relative``, they are divided by the mean square of the target in the node's graph plus the square of ``LEAST_STRESS``. Their mean is then that of the
+    squared relative L2 norms of the graphs, so that small stresses count as much as large ones.
 
     Args:
         predicted, target: stresses in the unit of the data set.
