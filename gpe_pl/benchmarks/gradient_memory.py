@@ -1,6 +1,6 @@
 """Benchmark of the memory of gradients: one gradient of an identification, through rollouts of several lengths.
 
-Steps are checkpointed, so memory should hardly grow with the length. Each gradient is measured in a process of its own.
+Steps are checkpointed, so memory should grow far less than the length. Each gradient is measured in a process of its own.
 """
 
 from __future__ import annotations

