@@ -28,7 +28,10 @@ SEGMENT = 20
 
 
 class Checkpointed:
-    """A learned simulator whose steps keep neither activations nor most states for gradients."""
+    """A learned simulator whose steps keep neither activations nor most states for gradients.
+
+    Gradients reach the tensors of the states, and not the weights of the model.
+    """
 
     def __init__(self, simulator: LearnedSimulator) -> None:
         self.simulator = simulator

@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from gpe_pl.geometry.shapes import Box, Shape, domain_walls, signed_distance
 from gpe_pl.schema import STICKY, MaterialValues, node_code
-from gpe_pl.solvers.scenes import CLEARANCE, Probability, check_domain, check_ranges, filled_box, floats, parameter_columns
+from gpe_pl.solvers.scenes import CLEARANCE, LiquidOnGrid, Probability, check_domain, check_ranges, filled_box, floats, parameter_columns
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State
@@ -24,7 +24,7 @@ Count = Annotated[int, Field(ge=1)]
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
-class ChannelScene:
+class ChannelScene(LiquidOnGrid):
     """Distribution of channels with an inlet and an outlet.
 
     Attributes:
@@ -75,27 +75,9 @@ class ChannelScene:
         return len(self.bounds)
 
     @property
-    def spacing(self) -> float:
-        """Rest spacing of particles in m."""
-        return self.grid_spacing / self.particles_per_cell
-
-    @property
-    def connectivity_radius(self) -> float:
-        """Recommended connectivity radius of a learned simulator in m."""
-        return self.connectivity_cells * self.grid_spacing
-
-    @property
-    def materials(self) -> tuple[str, ...]:
-        return ("fluid",)
-
-    @property
     def max_nodes(self) -> int:
         """Number of nodes that fill the whole domain, for the space that data need on a disk."""
         return math.ceil(float(np.prod([(high - low) / self.spacing for low, high in self.bounds])))
-
-    @property
-    def max_cells(self) -> int:
-        return 0
 
     @property
     def input_files(self) -> dict[str, str]:

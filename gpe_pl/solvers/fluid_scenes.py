@@ -22,6 +22,7 @@ from gpe_pl.schema import STICKY, MaterialValues, node_code
 from gpe_pl.solvers.scenes import (
     CLEARANCE,
     MAX_ATTEMPTS,
+    LiquidOnGrid,
     check_domain,
     check_ranges,
     draw_velocity,
@@ -48,7 +49,7 @@ class TerrainOptions:
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
-class FluidScene:
+class FluidScene(LiquidOnGrid):
     """Distribution of scenes with liquid.
 
     Attributes:
@@ -107,27 +108,9 @@ class FluidScene:
         return len(self.bounds)
 
     @property
-    def spacing(self) -> float:
-        """Rest spacing of particles in m."""
-        return self.grid_spacing / self.particles_per_cell
-
-    @property
-    def connectivity_radius(self) -> float:
-        """Recommended connectivity radius of a learned simulator in m."""
-        return self.connectivity_cells * self.grid_spacing
-
-    @property
-    def materials(self) -> tuple[str, ...]:
-        return ("fluid",)
-
-    @property
     def max_nodes(self) -> int:
         """Largest number of dynamic nodes of a scene."""
         return self.num_particles
-
-    @property
-    def max_cells(self) -> int:
-        return 0
 
     @property
     def input_files(self) -> dict[str, str]:

@@ -28,7 +28,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.geometry.shapes import Shape, domain_walls, signed_distance
 from gpe_pl.geometry.terrain import ground_of
 from gpe_pl.schema import STICKY, MaterialValues, node_code
-from gpe_pl.solvers.scenes import CLEARANCE, filled_box, parameter_columns
+from gpe_pl.solvers.scenes import CLEARANCE, LiquidOnGrid, filled_box, parameter_columns
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 
@@ -123,7 +123,7 @@ def _array(frame: Any, name: str) -> np.ndarray:
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
-class RecordedScene:
+class RecordedScene(LiquidOnGrid):
     """A recorded canyon, scaled so that its particles have the spacing of a trained model.
 
     The walls are sampled again at that spacing. Vertical walls surround the scene, and its top is open.
@@ -150,11 +150,6 @@ class RecordedScene:
     connectivity_cells: PositiveFloat = 1.5
 
     @property
-    def spacing(self) -> float:
-        """Rest spacing of particles in m."""
-        return self.grid_spacing / self.particles_per_cell
-
-    @property
     def scale(self) -> float:
         """Length of the scene divided by that of the recording; times scale with the square root of it."""
         return self.spacing / _read(self.file).spacing
@@ -171,22 +166,9 @@ class RecordedScene:
         return (0.0, float(length)), (0.0, float(width)), (0.0, float((1 + HEADROOM) * height))
 
     @property
-    def connectivity_radius(self) -> float:
-        """Recommended connectivity radius of a learned simulator in m."""
-        return self.connectivity_cells * self.grid_spacing
-
-    @property
-    def materials(self) -> tuple[str, ...]:
-        return ("fluid",)
-
-    @property
     def max_nodes(self) -> int:
         """Largest number of dynamic nodes of a scene."""
         return self.num_particles or len(_read(self.file).pos)
-
-    @property
-    def max_cells(self) -> int:
-        return 0
 
     @property
     def input_files(self) -> dict[str, str]:

@@ -214,11 +214,41 @@ def floats(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(v) for v in values)
 
 
+class OnGrid:
+    """Spacing and radius of particles that start in the cells of a grid."""
+
+    grid_spacing: float
+    particles_per_cell: int
+    connectivity_cells: float
+
+    @property
+    def spacing(self) -> float:
+        """Rest spacing of particles in m."""
+        return self.grid_spacing / self.particles_per_cell
+
+    @property
+    def connectivity_radius(self) -> float:
+        """Recommended connectivity radius of a learned simulator in m."""
+        return self.connectivity_cells * self.grid_spacing
+
+
+class LiquidOnGrid(OnGrid):
+    """Scenes of particles of a liquid."""
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        return ("fluid",)
+
+    @property
+    def max_cells(self) -> int:
+        return 0
+
+
 # --- bodies of particles --------------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
-class BodyScene:
+class BodyScene(OnGrid):
     """Bodies of random shape and material in a box with obstacles.
 
     Attributes:
@@ -274,15 +304,6 @@ class BodyScene:
     @property
     def dim(self) -> int:
         return len(self.bounds)
-
-    @property
-    def spacing(self) -> float:
-        """Rest spacing of particles in m."""
-        return self.grid_spacing / self.particles_per_cell
-
-    @property
-    def connectivity_radius(self) -> float:
-        return self.connectivity_cells * self.grid_spacing
 
     @property
     def max_nodes(self) -> int:
