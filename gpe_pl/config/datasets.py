@@ -35,6 +35,8 @@ STRIDE = "stride"
 """Key of ``data`` with the number of stored frames in a frame of a model. It selects frames when data are read; stored data do not depend on it."""
 SPACING, SCALES = "spacing_factor", "scales"
 """Keys of ``data`` with the factor on the spacing of nodes, which other keys contain, and with the scales of a training (``ScaleGrid``)."""
+SPACED_SCENE = "gpe_pl.solvers.scenes.BodyScene"
+"""Class of the scenes whose spacing has the factor ``spacing_factor``."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,8 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
 
     from gpe_pl.data.ground_truth import DatasetSpec
 
+    if cfg.data.get(SPACING, 1) != 1 or cfg.data.get(SCALES) is not None:
+        _check_spacing(cfg)
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
     values: dict[str, Any] = OmegaConf.to_container(cfg.data, resolve=True)  # type: ignore[assignment]
@@ -184,16 +188,23 @@ def _spaced(cfg: DictConfig, factor: float | int) -> dict[str, Any]:
     Raises:
         ConfigError: the data have no such factor.
     """
-    if SPACING not in cfg.data:
-        raise ConfigError(
-            f"spacing_factor={factor:g}: data={cfg.data.name} has none; choose data of bodies of particles, such as data=sand"
-        )
+    _check_spacing(cfg)
     before = cfg.data[SPACING]
     if factor == before:
         return {}
     grid = {"grid_spacing": factor * (cfg.data.scene.grid_spacing / before)}
     name = cfg.data.name.removesuffix(spacing_suffix(before)) + spacing_suffix(factor)
     return {"data": {SPACING: factor, "name": name, "scene": grid, "solver": grid}}
+
+
+def _check_spacing(cfg: DictConfig) -> None:
+    """Raise ``ConfigError`` if the spacing of the data has no factor. A factor would then change nothing but the configuration."""
+    kind = (cfg.data.get("scene") or {}).get("_target_", "")
+    if kind != SPACED_SCENE:
+        scenes = f"scenes of {kind.rpartition('.')[2]}" if kind else "imported scenes"
+        raise ConfigError(
+            f"data.spacing_factor, data.scales: the spacing of {scenes} has no factor; choose data of bodies of particles, such as data=sand"
+        )
 
 
 def training_parts(cfg: DictConfig) -> list[DictConfig]:

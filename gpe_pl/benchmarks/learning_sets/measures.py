@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,21 +23,23 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 MODEL = "model"
 STEPS_AT_ONCE = 16
-POOLED_BY: dict[str, Callable[[Sequence[float]], float]] = {
-    FULL: lambda values: float(np.sqrt(np.mean(np.square(values)))),
-    ONE_STEP: lambda values: float(np.sqrt(np.mean(np.square(values)))),
-    RIGIDITY: max,
+Axes = tuple[int, int]
+
+POOLED_BY: dict[str, Callable[[np.ndarray, Axes], Any]] = {
+    FULL: lambda table, axis: np.sqrt(np.square(table).mean(axis=axis)),
+    ONE_STEP: lambda table, axis: np.sqrt(np.square(table).mean(axis=axis)),
+    RIGIDITY: lambda table, axis: table.max(axis=axis),
 }
-"""How the values of several trajectories become one; all others by their mean."""
+"""How values [..., seed, trajectory] become one; all others by their mean."""
 
 
-def pooled(quantity: str, values: Sequence[float]) -> float:
-    """Return one value for the values of several trajectories."""
-    return POOLED_BY.get(quantity, lambda own: float(np.mean(own)))(values)
+def pooled(quantity: str, table: np.ndarray, axis: Axes = (-2, -1)) -> Any:
+    """Return one value for the values [..., seed, trajectory] of a quantity."""
+    return POOLED_BY.get(quantity, lambda own, axis: own.mean(axis=axis))(table, axis)
 
 
-def measured(checkpoint: Path, root: Path, learning_set: LearningSet) -> dict[str, dict[str, float]]:
-    """Return the quantities of the test split by simulator and name: of a trained model, and of the trivial baselines.
+def measured(checkpoint: Path, root: Path, learning_set: LearningSet) -> dict[str, dict[str, list[float]]]:
+    """Return the quantities of each trajectory of the test split by simulator and name: of a trained model, and of the trivial baselines.
 
     Args:
         checkpoint: the trained model.
@@ -52,7 +55,7 @@ def measured(checkpoint: Path, root: Path, learning_set: LearningSet) -> dict[st
                 values[ONE_STEP] = one_step_error(simulator, name, scene.trajectory, learning_set.start)
             for quantity, value in values.items():
                 found.setdefault(name, {}).setdefault(quantity, []).append(value)
-    return {name: {quantity: pooled(quantity, values) for quantity, values in own.items()} for name, own in found.items()}
+    return found
 
 
 def lasting(prediction: Trajectory, num_frames: int) -> tuple[Trajectory, np.ndarray]:

@@ -14,22 +14,24 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 from pydantic import Field
 
 from gpe_pl.benchmarks.learning_sets.measures import MODEL, measured, pooled, trivial
-from gpe_pl.benchmarks.learning_sets.sets import QUANTITIES, SETS, SetName
+from gpe_pl.benchmarks.learning_sets.sets import QUANTITIES, RIGIDITY, SETS, SetName
 from gpe_pl.data.importers import ImportSettings, import_dataset
 from gpe_pl.data.importers.assemble import FOLDER
 from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
+from gpe_pl.metrics.rollouts import bootstrap_interval
 
 RESUMES = True
 """``run`` takes a folder and continues where an earlier run was stopped."""
 
 MEASURED_FILE = "measured.json"
-HEADER = ["data set", "quantity", "published", "trivial baseline", "model", "splits", "seeds"]
+HEADER = ["data set", "quantity", "published", "trivial baseline", "model", "splits", "seeds", "core-minutes"]
 
 
 class LearningSetError(GpeError, RuntimeError):
@@ -44,6 +46,7 @@ class Settings:
         folder: folder with the files of the data sets.
         only: data sets that are trained and evaluated. What is there of the others is reported.
         seeds: seeds of the trainings.
+        minutes: training time on one core or GPU [min], which decides the number of steps; validation and evaluation come on top.
         num_splits: maximum number of splits of a data set that leaves one trajectory out after the other; None for all.
         training: overrides of ``python -m gpe_pl.fit`` for each data set.
         num_threads: threads of PyTorch in evaluations.
@@ -52,6 +55,7 @@ class Settings:
     folder: str = "outside"
     only: list[SetName] = field(default_factory=lambda: list(SETS))
     seeds: Annotated[list[int], Field(min_length=1)] = field(default_factory=lambda: [0])
+    minutes: Annotated[float, Field(gt=0)] = 10.0
     num_splits: Annotated[int, Field(ge=1)] | None = None
     training: dict[SetName, list[str]] = field(default_factory=dict)
     num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
@@ -70,12 +74,12 @@ def run(settings: Settings, folder: Path) -> tuple[list[dict[str, Any]], str]:
         if (source / SETS[name].source).is_dir():
             for label, splits in list(SETS[name].parts().items())[: settings.num_splits]:
                 for seed in settings.seeds:
-                    _trained(name, label, splits, seed, source, folder, settings.training.get(name, []))
+                    _trained(name, label, splits, seed, source, folder, settings)
     records = records_in(folder)
     return records, report(records, source)
 
 
-def _trained(name: SetName, label: str, splits: Mapping[str, Any], seed: int, source: Path, folder: Path, overrides: Sequence[str]) -> None:
+def _trained(name: SetName, label: str, splits: Mapping[str, Any], seed: int, source: Path, folder: Path, settings: Settings) -> None:
     """Import, train and measure one split with one seed, as far as it has not been done."""
     learning_set = SETS[name]
     dataset = "_".join([name, *label.split()])
@@ -83,6 +87,7 @@ def _trained(name: SetName, label: str, splits: Mapping[str, Any], seed: int, so
     if not root.is_dir():
         import_dataset(folder / "data", ImportSettings(learning_set.format, str(source / learning_set.source), name=dataset, **splits))
     run_name = f"{dataset}_seed_{seed}"
+    overrides = [*settings.training.get(name, []), f"training.budget_minutes={settings.minutes:g}"]
     about = ["data=imported", f"data.name={dataset}", f"name={run_name}", f"seed={seed}", *overrides]
     paths = [f"paths.data={folder / 'data'}", f"paths.runs={folder / 'runs'}"]
     if subprocess.run([sys.executable, "-m", "gpe_pl.fit", *about, *paths], check=False).returncode:
@@ -92,7 +97,8 @@ def _trained(name: SetName, label: str, splits: Mapping[str, Any], seed: int, so
     stored = folder / "runs" / run_name / MEASURED_FILE
     if not stored.is_file() or json.loads(stored.read_text(encoding="utf-8"))["checkpoint"] != digest:
         values = measured(checkpoint, root, learning_set)
-        record = {"set": name, "split": label, "seed": seed, "training": list(overrides), "values": values, "checkpoint": digest}
+        about_run = {"set": name, "split": label, "seed": seed, "minutes": settings.minutes, "training": overrides}
+        record = {**about_run, "values": values, "checkpoint": digest}
         replace_text(stored, json.dumps(record) + "\n")
 
 
@@ -118,24 +124,28 @@ def table(records: Sequence[Mapping[str, Any]]) -> list[str]:
 
 NOTE = (
     "Test trajectories are never trained on. RMS distances are pooled over frames, nodes, trajectories and splits. Relative L2 norms are means over frames. "
-    "Over several seeds: mean and range. The trivial baseline is the best one."
+    "Intervals are 95 % bootstrap intervals over seeds and test trajectories. With one seed they do not contain the spread between seeds, and with three they "
+    "underestimate it. The trivial baseline is the best one. Core-minutes are training time."
 )
 
 
 def _rows(name: SetName, records: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the rows of a data set; one that says so if nothing was measured."""
     if not records:
-        return [table_row([name, "", "", "", "not measured", "", ""])]
+        return [table_row([name, "", "", "", "not measured", *[""] * 3])]
     learning_set, lines = SETS[name], list[str]()
     seeds = sorted({record["seed"] for record in records})
+    by_run = {(record["split"], record["seed"]): record for record in records}
+    splits = [split for split in learning_set.parts() if all((split, seed) in by_run for seed in seeds)]
+    if not splits:
+        return [table_row([name, "", "", "", "no split with all seeds", "", ", ".join(map(str, seeds)), ""])]
+    known = [[by_run[split, seed] for split in splits] for seed in seeds]
+    minutes = sorted({record["minutes"] for own in known for record in own})
     for quantity in QUANTITIES:
-        known = [record for record in records if quantity in record["values"][MODEL]]
-        if not known:
+        if any(quantity not in record["values"][MODEL] for own in known for record in own):
             continue
-        own = [pooled(quantity, [r["values"][MODEL][quantity] for r in known if r["seed"] == seed]) for seed in seeds]
-        best = trivial(_baselines(known, quantity), quantity)
+        best = trivial(_baselines(known[0], quantity), quantity)
         published = learning_set.published.get(quantity)
-        splits = sorted({record["split"] for record in known})
         cells = [
             *(
                 name,
@@ -143,18 +153,30 @@ def _rows(name: SetName, records: Sequence[Mapping[str, Any]]) -> list[str]:
                 "" if published is None else f"{published:.3g}",
                 "" if best is None else f"{best[1]:.3g} ({best[0].replace('_', ' ')})",
             ),
-            f"{sum(own) / len(own):.3g}" + (f" ({min(own):.3g} – {max(own):.3g})" if len(own) > 1 else ""),
+            _estimate(quantity, np.array([[x for record in own for x in record["values"][MODEL][quantity]] for own in known])),
             f"{len(splits)} of {len(learning_set.parts())}",
             ", ".join(map(str, seeds)),
+            ", ".join(f"{value:g}" for value in minutes),
         ]
         lines.append(table_row(cells))
     return lines
 
 
+def _estimate(quantity: str, table: np.ndarray) -> str:
+    """Return the pooled value of a table [seed, trajectory], with an interval if there are several and it is not a maximum."""
+    if table.size == 1 or quantity == RIGIDITY:
+        return f"{pooled(quantity, table):.3g}"
+    found = bootstrap_interval(table, lambda own, axis: pooled(quantity, own, axis))
+    return f"{found.estimate:.3g} [{found.low:.3g}, {found.high:.3g}]"
+
+
 def _baselines(records: Sequence[Mapping[str, Any]], quantity: str) -> dict[str, dict[str, float]]:
-    """Return the pooled values of each baseline."""
+    """Return the pooled values of each baseline. They do not depend on seeds."""
     names = [name for name in records[0]["values"] if name != MODEL and quantity in records[0]["values"][name]]
-    return {name: {quantity: pooled(quantity, [r["values"][name][quantity] for r in records])} for name in names}
+    return {
+        name: {quantity: float(pooled(quantity, np.array([[x for record in records for x in record["values"][name][quantity]]])))}
+        for name in names
+    }
 
 
 def missing_sets(source: Path) -> list[tuple[str, str]]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gpe_pl.benchmarks.learning_sets import measures, suite
-from gpe_pl.benchmarks.learning_sets.sets import FULL, ONE_STEP, POSITION, RIGIDITY, SETS, SPACING, STRESS, VELOCITY
+from gpe_pl.benchmarks.learning_sets.sets import FULL, ONE_STEP, POSITION, RIGIDITY, SETS, SPACING, STRESS, VELOCITY, SetName
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -33,10 +33,11 @@ def test_central_velocities_are_those_of_an_accelerated_motion() -> None:
     np.testing.assert_allclose(measures.central_velocities(pos, 0.1)[:, 0, 0], (2.0 + 3.0 * time[1:])[:, 0, 0])
 
 
-def test_values_of_trajectories_become_one() -> None:
-    assert measures.pooled(FULL, [3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
-    assert measures.pooled(RIGIDITY, [3.0, 4.0]) == 4.0
-    assert measures.pooled(POSITION, [3.0, 4.0]) == 3.5
+def test_values_of_seeds_and_trajectories_become_one() -> None:
+    table = np.array([[3.0, 4.0], [3.0, 4.0]])
+    assert measures.pooled(FULL, table) == pytest.approx(np.sqrt(12.5))
+    assert measures.pooled(RIGIDITY, table) == 4.0
+    assert measures.pooled(POSITION, table) == 3.5
 
 
 def test_the_best_baseline_has_the_smallest_error_or_the_ratio_nearest_to_one() -> None:
@@ -52,23 +53,37 @@ def test_splits_leave_one_out_or_are_published() -> None:
     assert SETS["rigidfall"].parts()[""]["splits"]["test"] == [8, 9]
 
 
-def record(split: str, seed: int, model: float, baseline: float) -> dict[str, Any]:
-    values = {"model": {FULL: model, SPACING: 0.9}, "ballistic": {FULL: baseline}}
-    return {"set": "fluidfall", "split": split, "seed": seed, "values": values}
+def record(split: str, seed: int, model: float, baseline: float, minutes: float = 10.0) -> dict[str, Any]:
+    values = {"model": {FULL: [model], SPACING: [0.9], RIGIDITY: [1e-15 * model]}, "ballistic": {FULL: [baseline]}}
+    return {"set": "fluidfall", "split": split, "seed": seed, "minutes": minutes, "values": values}
 
 
-def test_the_table_pools_splits_and_gives_the_range_of_seeds(tmp_path: Path) -> None:
-    records = [
-        record("without 0", 0, 3.0, 5.0),
-        record("without 1", 0, 4.0, 12.0),
-        record("without 0", 1, 1.0, 5.0),
-        record("without 1", 1, 1.0, 12.0),
-    ]
-    text = suite.report(records, tmp_path)
-    assert "| fluidfall | full rollout, RMS distance [m] | 0.0415 | 9.19 (ballistic) | 2.27 (1 – 3.54) | 2 of 5 | 0, 1 |" in text
-    assert "| fluidfall | spacing of the settled liquid over the truth's |  |  | 0.9 (0.9 – 0.9) | 2 of 5 | 0, 1 |" in text
-    assert "| beam |  |  |  | not measured |  |  |" in text
+RECORDS = [
+    record("without 0", 0, 3.0, 5.0),
+    record("without 1", 0, 4.0, 12.0),
+    record("without 0", 1, 1.0, 5.0),
+    record("without 1", 1, 1.0, 12.0, minutes=5.0),
+]
+
+
+def test_the_table_pools_splits_and_seeds_with_an_interval(tmp_path: Path) -> None:
+    text = suite.report(RECORDS, tmp_path)
+    # a resample of seeds and trajectories has at least the error of the best seed, and at most that of the worst trajectory
+    assert "| fluidfall | full rollout, RMS distance [m] | 0.0415 | 9.19 (ballistic) | 2.6 [1, 4] | 2 of 5 | 0, 1 | 5, 10 |" in text
+    assert "| fluidfall | spacing of the settled liquid over the truth's |  |  | 0.9 [0.9, 0.9] | 2 of 5 | 0, 1 | 5, 10 |" in text
+    assert "| fluidfall | change of distances in a body over its size |  |  | 4e-15 | 2 of 5 | 0, 1 | 5, 10 |" in text
+    assert "| beam |  |  |  | not measured |  |  |  |" in text
     assert f"- beam: put data/database_beam of github.com/quercushernandez/ThermodynamicsGNN into {tmp_path / 'database_beam'}" in text
+
+
+def test_splits_that_lack_a_seed_are_left_out_of_the_table() -> None:
+    lines = suite.table([*RECORDS, record("without 2", 0, 100.0, 100.0)])
+    assert any("| 9.19 (ballistic) | 2.6 [1, 4] | 2 of 5 |" in line for line in lines)
+    assert any("no split with all seeds" in line for line in suite.table([RECORDS[0], RECORDS[3]]))
+
+
+def test_one_seed_and_trajectory_have_no_interval() -> None:
+    assert any("| 5 (ballistic) | 3 | 1 of 5 | 0 | 10 |" in line for line in suite.table(RECORDS[:1]))
 
 
 @pytest.fixture
@@ -94,19 +109,21 @@ def test_every_split_is_trained_and_measured_once(tmp_path: Path, falls: Path, m
         return SimpleNamespace(returncode=0)
 
     monkeypatch.setattr(subprocess, "run", trained)
-    settings = suite.Settings(str(falls), only=["fluidfall", "beam"], seeds=[3], num_splits=2, training={"fluidfall": ["graph.history=2"]})
+    overrides: dict[SetName, list[str]] = {"fluidfall": ["graph.history=2"]}
+    settings = suite.Settings(str(falls), only=["fluidfall", "beam"], seeds=[3], minutes=0.5, num_splits=2, training=overrides)
     records, text = suite.run(settings, tmp_path / "runs")
     assert [(r["set"], r["split"], r["seed"]) for r in records] == [("fluidfall", "without 0", 3), ("fluidfall", "without 1", 3)]
     assert [c["name"] for c in commands] == ["fluidfall_without_0_seed_3", "fluidfall_without_1_seed_3"]
-    assert all(c["seed"] == "3" and c["graph.history"] == "2" for c in commands)
+    assert all(c["seed"] == "3" and c["graph.history"] == "2" and c["training.budget_minutes"] == "0.5" for c in commands)
+    assert all(record["minutes"] == 0.5 for record in records)
     assert records[0]["values"]["model"].keys() == {FULL, ONE_STEP, SPACING}
-    assert records[0]["values"]["constant_velocity"][ONE_STEP] < records[0]["values"]["constant_velocity"][FULL]
-    assert "| 2 of 5 | 3 |" in text and "beam: put" in text
+    assert records[0]["values"]["constant_velocity"][ONE_STEP][0] < records[0]["values"]["constant_velocity"][FULL][0]
+    assert "| 2 of 5 | 3 | 0.5 |" in text and "beam: put" in text
 
 
 def test_a_training_that_fails_names_its_command(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
-    with pytest.raises(suite.LearningSetError, match=r"name=fluidfall_without_0_seed_0 seed=0: failed"):
+    with pytest.raises(suite.LearningSetError, match=r"name=fluidfall_without_0_seed_0 seed=0 training.budget_minutes=10: failed"):
         suite.run(suite.Settings(str(falls), only=["fluidfall"], num_splits=1), tmp_path / "runs")
 
 

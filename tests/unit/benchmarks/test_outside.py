@@ -52,7 +52,8 @@ def test_the_report_names_what_is_missing_and_what_is_there(tmp_path: Path, monk
     line = Curve("solver", np.array([1.0, 3.0]), np.array([1.0, 3.0]))
     curves = [Curve("law", np.array([2.0]), np.array([4.0])), line, Curve("model", np.array([1.0, 3.0]), np.array([np.nan, np.nan]))]
     records = [{"experiment": "droplet", "model": "m", "series": c.series, "x": c.x.tolist(), "y": c.y.tolist()} for c in curves]
-    measured = [{"set": "ricegrip", "split": "", "seed": 0, "values": {"model": {FULL: 0.25}, "ballistic": {FULL: 0.5}}}]
+    values = {"model": {FULL: [0.25]}, "ballistic": {FULL: [0.5]}}
+    measured = [{"set": "ricegrip", "split": "", "seed": 0, "minutes": 10.0, "values": values}]
     text = suite.report(records, missing, tmp_path, measured)
     assert "| droplet | m | law | 1 | 50.0 % | not measured |" in text
     assert "- Engine: install it" in text

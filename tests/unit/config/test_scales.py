@@ -40,7 +40,7 @@ def test_without_scales_a_training_has_its_own_data() -> None:
         ((SCALES[0], "data.scales={spacing_factors: [], strides: [1]}"), r"data.scales.spacing_factors"),
         ((SCALES[0], "data.scales={spacing_factors: [1], strides: [0]}"), r"data.scales.strides"),
         ((*SCALES, "training.targets=solver"), "data.scales: works with training.targets=trajectory"),
-        (("data=fem", "+evaluation.data.spacing_factor=2"), "spacing_factor=2: data=fem has none"),
+        (("data=fem", "+evaluation.data.spacing_factor=2"), "the spacing of scenes of SolidScene has no factor"),
     ],
 )
 def test_what_cannot_be_is_refused(overrides: tuple[str, ...], message: str) -> None:
@@ -48,3 +48,18 @@ def test_what_cannot_be_is_refused(overrides: tuple[str, ...], message: str) -> 
     with pytest.raises(ConfigError, match=message):
         training_parts(cfg)
         evaluated_config(cfg)
+
+
+@pytest.mark.parametrize("scaling", [(), ("scaling=specialist",), ("scaling=general",)])
+@pytest.mark.parametrize("data", ["fem", "fluid", "channel"])
+def test_the_experiment_is_refused_at_once_for_data_of_one_spacing(data: str, scaling: tuple[str, ...]) -> None:
+    with pytest.raises(
+        ConfigError, match="the spacing of scenes of .*Scene has no factor; choose data of bodies of particles, such as data=sand"
+    ):
+        evaluated_config(compose("fit", "experiment=scales", f"data={data}", *scaling))
+
+
+@pytest.mark.parametrize("key", ["spacing_factor=2", "scales={spacing_factors: [1], strides: [1]}"])
+def test_a_spacing_without_effect_is_refused_before_data_are_made(key: str) -> None:
+    with pytest.raises(ConfigError, match="the spacing of scenes of SolidScene has no factor"):
+        dataset_spec(compose("fit", "data=fem", f"+data.{key}"))
