@@ -88,7 +88,8 @@ def _trained(name: SetName, label: str, splits: Mapping[str, Any], seed: int, so
         import_dataset(folder / "data", ImportSettings(learning_set.format, str(source / learning_set.source), name=dataset, **splits))
     run_name = f"{dataset}_seed_{seed}"
     overrides = [*settings.training.get(name, []), f"training.budget_minutes={settings.minutes:g}"]
-    about = ["data=imported", f"data.name={dataset}", f"name={run_name}", f"seed={seed}", *overrides]
+    shared = f"reuse={dataset}"  # seeds share a measured step time, which is stored there, so they have equal numbers of steps
+    about = ["data=imported", f"data.name={dataset}", f"name={run_name}", f"seed={seed}", shared, *overrides]
     paths = [f"paths.data={folder / 'data'}", f"paths.runs={folder / 'runs'}"]
     if subprocess.run([sys.executable, "-m", "gpe_pl.fit", *about, *paths], check=False).returncode:
         raise LearningSetError(f"python -m gpe_pl.fit {' '.join(about)}: failed; its messages are above")

@@ -114,6 +114,7 @@ def test_every_split_is_trained_and_measured_once(tmp_path: Path, falls: Path, m
     records, text = suite.run(settings, tmp_path / "runs")
     assert [(r["set"], r["split"], r["seed"]) for r in records] == [("fluidfall", "without 0", 3), ("fluidfall", "without 1", 3)]
     assert [c["name"] for c in commands] == ["fluidfall_without_0_seed_3", "fluidfall_without_1_seed_3"]
+    assert [c["reuse"] for c in commands] == ["fluidfall_without_0", "fluidfall_without_1"]
     assert all(c["seed"] == "3" and c["graph.history"] == "2" and c["training.budget_minutes"] == "0.5" for c in commands)
     assert all(record["minutes"] == 0.5 for record in records)
     assert records[0]["values"]["model"].keys() == {FULL, ONE_STEP, SPACING}
@@ -123,7 +124,9 @@ def test_every_split_is_trained_and_measured_once(tmp_path: Path, falls: Path, m
 
 def test_a_training_that_fails_names_its_command(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
-    with pytest.raises(suite.LearningSetError, match=r"name=fluidfall_without_0_seed_0 seed=0 training.budget_minutes=10: failed"):
+    with pytest.raises(
+        suite.LearningSetError, match=r"name=fluidfall_without_0_seed_0 seed=0 reuse=fluidfall_without_0 training.budget_minutes=10: failed"
+    ):
         suite.run(suite.Settings(str(falls), only=["fluidfall"], num_splits=1), tmp_path / "runs")
 
 
