@@ -1,4 +1,4 @@
-"""Writes input decks of a cantilever and of a clamped plate under load, and runs CalculiX on them.
+"""Writes input decks of a cantilever, a clamped plate and a quarter of a plate under load, and runs CalculiX on them.
 
 ``python docs/fem_decks.py cantilever FOLDER`` writes ``FOLDER/{train,val,test}/NAME.inp``, and results beside them if ``ccx`` is installed (on Debian
 ``apt-get install calculix-ccx``). ``python -m gpe_pl.convert format=calculix source=FOLDER`` imports them. Young's modulus and the load differ between scenes.
@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -22,21 +23,22 @@ CCX = "ccx"
 
 @dataclass(frozen=True)
 class Case:
-    """A block of hexahedra that is clamped at its low end along x, or at all its sides, and loaded along its last axis.
+    """A block of hexahedra that is held at some sides and loaded along its last axis.
 
     Attributes:
         cells: number of cells along each axis.
         size: width of a cell [m].
-        sides: clamp all four sides instead of one end.
+        support: clamp the low ``end`` along x; all four ``sides``; or, for a ``quarter`` of a plate, the sides that are high along x and y, with rollers at
+            the low ones, which are planes of symmetry.
         modulus, poisson_ratio, density: Young's modulus [Pa], Poisson's ratio and density [kg/m³].
-        load: total force [N], which rises within ``rise`` [s] and then stays.
+        load: total force [N], or pressure [Pa] on the upper side of a quarter. It rises within ``rise`` [s] and then stays.
         element: kind of the hexahedra in CalculiX. C3D8I bends without locking, C3D8 is the plain one.
         frame_dt, num_frames: time between results [s] and their number.
     """
 
     cells: tuple[int, int, int]
     size: float
-    sides: bool
+    support: Literal["end", "sides", "quarter"]
     modulus: float
     load: float
     frame_dt: float
@@ -48,8 +50,9 @@ class Case:
 
 
 CASES = {
-    "cantilever": Case((16, 2, 2), 0.01, False, 1e6, -0.05, 4e-3, 60),
-    "plate": Case((12, 12, 1), 0.015, True, 1e6, -20.0, 2e-3, 50),
+    "cantilever": Case((16, 2, 2), 0.01, "end", 1e6, -0.05, 4e-3, 60),
+    "plate": Case((12, 12, 1), 0.015, "sides", 1e6, -20.0, 2e-3, 50),
+    "quarter": Case((8, 8, 2), 0.01, "quarter", 1e6, 4000.0, 2e-3, 50),
 }
 
 
@@ -61,19 +64,30 @@ def deck(case: Case) -> str:
     corners = [(low, low), (high, low), (high, high), (low, high)]
     cells = np.stack([number[(*xy, z)] for z in (low, high) for xy in corners], axis=-1).reshape(-1, 8)
     edge = np.zeros(number.shape, bool)
-    edge[0] = True
-    if case.sides:
-        edge[-1] = edge[:, 0] = edge[:, -1] = True
-    loaded = number[:, :, -1][~edge[:, :, -1]] if case.sides else number[-1].ravel()
+    edge[0 if case.support != "quarter" else -1] = True
+    if case.support == "sides":
+        edge[-1] = edge[:, 0] = True
+    if case.support != "end":
+        edge[:, -1] = True
+    loaded = number[-1].ravel() if case.support == "end" else number[:, :, -1][~edge[:, :, -1]]
     lines = ["*NODE, NSET=ALL", *(f"{k}, {x:.9g}, {y:.9g}, {z:.9g}" for k, (x, y, z) in enumerate(points, start=1))]
     lines += [f"*ELEMENT, TYPE={case.element}, ELSET=BODY", *(f"{k}, {', '.join(map(str, own))}" for k, own in enumerate(cells, start=1))]
     lines += ["*NSET, NSET=CLAMPED", *(f"{node}," for node in number[edge])]
     lines += ["*NSET, NSET=LOADED", *(f"{node}," for node in loaded.ravel())]
     lines += ["*MATERIAL, NAME=RUBBER", "*ELASTIC", f"{case.modulus:.9g}, {case.poisson_ratio}", "*DENSITY", f"{case.density}"]
     lines += ["*SOLID SECTION, ELSET=BODY, MATERIAL=RUBBER", "*AMPLITUDE, NAME=RISE", f"0., 0., {case.rise}, 1., 1000., 1."]
-    lines += ["*BOUNDARY", "CLAMPED, 1, 3", "*STEP, NLGEOM, INC=100000"]
+    lines += ["*BOUNDARY", "CLAMPED, 1, 3"]
+    if case.support == "quarter":
+        lines += ["*NSET, NSET=ALONG_X", *(f"{node}," for node in number[0].ravel()), "*NSET, NSET=ALONG_Y"]
+        lines += [*(f"{node}," for node in number[:, 0].ravel()), "*BOUNDARY", "ALONG_X, 1", "ALONG_Y, 2"]
+        top = 1 + np.arange(len(cells)).reshape(case.cells)[:, :, -1].ravel()
+        lines += ["*SURFACE, NAME=TOP", *(f"{cell}, S2" for cell in top)]
+    lines += ["*STEP, NLGEOM, INC=100000"]
     lines += ["*DYNAMIC, DIRECT", f"{case.frame_dt:.9g}, {case.frame_dt * case.num_frames:.9g}"]
-    lines += ["*CLOAD, AMPLITUDE=RISE", f"LOADED, 3, {case.load / loaded.size:.9g}"]
+    if case.support == "quarter":
+        lines += ["*DSLOAD, AMPLITUDE=RISE", f"TOP, P, {case.load:.9g}"]
+    else:
+        lines += ["*CLOAD, AMPLITUDE=RISE", f"LOADED, 3, {case.load / loaded.size:.9g}"]
     lines += ["*NODE FILE, FREQUENCY=1", "U, V", "*EL FILE, FREQUENCY=1", "S", "*END STEP"]
     return "\n".join(lines) + "\n"
 

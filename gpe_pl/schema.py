@@ -93,8 +93,10 @@ MaterialValues = float | Mapping[str, float]
 MESH_MATERIALS = ("elastomer", "solid")
 """Materials whose nodes keep their neighbours. With ``graph.mesh`` their nodes are connected along mesh cells."""
 
-LOADS = ("motion", "force")
-"""What data sets can give of nodes as boundary conditions: the motion of some nodes, and forces on nodes."""
+LOADS = ("motion", "sliding", "force")
+"""What data sets can give of nodes as boundary conditions: the motion of nodes, their motion along some axes only, as on rollers, and forces on nodes.
+Data sets with ``sliding`` have ``motion``, too.
+"""
 
 CELL_KINDS: dict[str, tuple[int, int]] = {
     "line": (1, 2),
@@ -290,6 +292,15 @@ FIELDS: dict[str, Field] = {
         "uint8",
         "1",
         "1 for nodes whose motion is given, such as clamped ones, and 0 for others; without it, no motion is given",
+        required=False,
+        values="0 to 1",
+    ),
+    "prescribed_axes": Field(
+        ("node", "dim"),
+        "uint8",
+        "1",
+        "1 along axes along which the motion of a node is given, and 0 along others; takes the place of prescribed if the motion of some node is given along "
+        "some axes only, as on rollers",
         required=False,
         values="0 to 1",
     ),

@@ -50,11 +50,16 @@ class Augmentation:
         """Check that scenes have the symmetries.
 
         Raises:
-            AugmentationError: windows are to be turned in 2D, without one axis of gravity, or in a periodic domain, or moved in a periodic domain.
+            AugmentationError: windows are to be turned in 2D, without one axis of gravity, in a periodic domain, or with nodes that are held along some axes;
+                or moved in a periodic domain.
         """
         if self.rotate and (metadata.dim != 3 or np.count_nonzero(metadata.gravity) > 1):
             raise AugmentationError(
                 "training.rotate=true: needs scenes in 3D with gravity along one axis or none; choose training.mirror=true"
+            )
+        if self.rotate and "sliding" in (metadata.loads or ()):
+            raise AugmentationError(
+                "training.rotate=true: some nodes are held along some axes only, which stay as they are; choose training.mirror=true"
             )
         if self.is_beyond_mirror and any(metadata.periodic):
             raise AugmentationError(

@@ -408,8 +408,10 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
                 if trajectory.alive is None
                 else np.all([trajectory.alive[k:][: len(acc)] for k in range(3)], axis=0)
             )
-            counted = (stays & trajectory.is_predicted)[..., None]
-            square = np.where(counted, acc**2, 0.0).sum(axis=(1, 2)) / np.maximum(1, metadata.dim * counted.sum(axis=(1, 2)))
+            counted = np.repeat(stays[..., None], metadata.dim, axis=2)
+            if trajectory.prescribed is not None:
+                counted &= ~trajectory.prescribed
+            square = np.where(counted, acc**2, 0.0).sum(axis=(1, 2)) / np.maximum(1, counted.sum(axis=(1, 2)))
             values.append(np.sqrt(square)[self.builder.config.history - 1 :])
         return np.concatenate(values)
 
@@ -441,13 +443,15 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         trajectory = self.augmentation.moved(reflection.trajectory(original), history, self.seed, sample)
         dt = trajectory.metadata.frame_dt
         truth = continued(trajectory)
-        pos, is_given = truth[: history + 2], ~trajectory.is_predicted | carried(trajectory.openings, truth[history])
+        pos, is_given = truth[: history + 2], carried(trajectory.openings, truth[history])[:, None]
+        if trajectory.prescribed is not None:
+            is_given = is_given | trajectory.prescribed
         if self.noise is not None:
             rng = np.random.default_rng((self.seed, sample))
             unit = self.velocity_unit if scale is None else self.velocity_units.get(scale, self.velocity_unit)
             pos = self.noise.apply(pos, builder.metadata.longest_side, unit, dt, rng)
             if is_given.any():  # their motion is given exactly
-                pos = np.where(is_given[:, None], truth[: history + 2], pos)
+                pos = np.where(is_given, truth[: history + 2], pos)
         velocities = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
         gravity = np.asarray(trajectory.metadata.gravity)
         past = np.ascontiguousarray(velocities[:-1].swapaxes(0, 1))

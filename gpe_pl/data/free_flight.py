@@ -109,7 +109,8 @@ def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames:
 
     Args:
         metadata: metadata of the trajectory.
-        arrays: arrays by their names in ``schema.FIELDS``: ``pos``, ``mass``, ``boundary_pos`` and, if there are any, ``cells``, ``prescribed`` and ``force``.
+        arrays: arrays by their names in ``schema.FIELDS``: ``pos``, ``mass``, ``boundary_pos`` and, if there are any, ``cells``, ``prescribed`` or
+            ``prescribed_axes``, and ``force``.
         most_frames: maximum number of frames that are examined, evenly spread.
     """
     pos, mass = arrays["pos"].astype(np.float64), arrays["mass"].astype(np.float64)
@@ -141,10 +142,12 @@ def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames:
 
 
 def _are_loaded(arrays: dict[str, np.ndarray], frame: int) -> np.ndarray:
-    """Return a mask [node] of the nodes whose motion is given, and of those on which a force acts just before or after a frame."""
+    """Return a mask [node] of the nodes whose motion is given along some axis, and of those on which a force acts just before or after a frame."""
     mask = np.zeros(len(arrays["mass"]), bool)
     if "prescribed" in arrays:
         mask |= arrays["prescribed"] != 0
+    if "prescribed_axes" in arrays:
+        mask |= (arrays["prescribed_axes"] != 0).any(axis=1)
     if "force" in arrays:
         mask |= (arrays["force"][frame - 1 : frame + 1] != 0).any(axis=(0, 2))
     return mask

@@ -48,9 +48,9 @@ def acceleration_std(trajectories: Iterable[Trajectory]) -> float:
 
 
 def motion(trajectory: Trajectory) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield velocities [m/s] and accelerations without gravity [m/s²] by name, each [..., dim], for a part of the frames at a time.
+    """Yield velocities [m/s] and accelerations without gravity [m/s²] by name, for a part of the frames at a time.
 
-    Nodes whose motion is given are left out, and nodes of open scenes while they are not in the scene.
+    Nodes whose motion is given along all axes are left out, and nodes of open scenes while they are not in the scene.
     """
     dt = trajectory.metadata.frame_dt
     for start in range(0, max(1, trajectory.num_frames - 2), FRAMES_AT_ONCE):

@@ -180,7 +180,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     is_told = config.scales == "dimensionless"
     channels = {r: _edge_channels(config.features, r, dim, is_told) for r in relations}
     loads = metadata.loads or ()
-    of_loads = (1 + dim) * ("motion" in loads) + dim * ("force" in loads)
+    of_loads = (1 + dim) * ("motion" in loads) + dim * ("sliding" in loads) + dim * ("force" in loads)
     return FeatureSpec(
         dim=dim,
         materials=materials,

@@ -1,7 +1,8 @@
 """Features of the loads of a scene: nodes whose motion is given, and forces on nodes. Data sets without loads have none of them.
 
-Channels follow those of motion and gravity in ``x`` of each material. For given motion they are 1 at prescribed nodes and 0 elsewhere, and by how much the
-velocity of a prescribed node will change to its next position, which is 0 elsewhere. For forces they are f/m. Both are in the units of ``features.Scales``.
+Channels follow those of motion and gravity in ``x`` of each material. For given motion they are 1 at nodes that are prescribed along all axes and 0 elsewhere,
+and by how much the velocity of a prescribed node will change to its next position, which is 0 along axes that are not given. Data sets with nodes that are
+prescribed along some axes only also have 1 for each axis along which a node is. For forces they are f/m. Values are in the units of ``features.Scales``.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ def add_loads(
 ) -> None:
     """Append the features of loads to ``x`` of each material, and store what models need of the loads.
 
-    Stores get ``prescribed`` [node], true where the motion is given, and ``load`` [node, dim], the acceleration f/m in m/s². They have only the entries of the
-    loads that the data set has.
+    Stores get ``prescribed`` [node, dim], true along axes along which the motion is given, and ``load`` [node, dim], the acceleration f/m in m/s². They have
+    only the entries of the loads that the data set has.
 
     Args:
         data: graph of the state, whose ``x`` has motion and gravity.
@@ -54,31 +55,33 @@ def add_loads(
         if "motion" in spec.loads:
             store.prescribed = prescribed[rows]
             if spec.cells and material in spec.meshes:  # the law keeps this velocity within the frame, and walls do not stop it
-                held = store.prescribed[:, None]
+                held = store.prescribed
                 given = (state.vel + change)[rows].to(store.velocity) * scales.frame_dt
                 mean, at_frame = store.velocity.split(spec.dim, dim=1)
                 store.velocity = torch.cat([mean, torch.where(held, given, at_frame)], dim=1)
-                store.wall = torch.where(held, 0.0, store.wall)
+                store.wall = torch.where(held.all(dim=1, keepdim=True), 0.0, store.wall)
         if "force" in spec.loads:
             store.load = load[rows].to(precision)
 
 
 def _columns(loads: Iterable[str], prescribed: Tensor, change: Tensor, load: Tensor) -> Iterable[Tensor]:
     if "motion" in loads:
-        yield from (prescribed[:, None].to(change.dtype), change)
+        yield from (prescribed.all(dim=1, keepdim=True).to(change.dtype), change)
+    if "sliding" in loads:
+        yield prescribed.to(change.dtype)
     if "force" in loads:
         yield load
 
 
 def _values(state: State, scales: Scales) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mask of prescribed nodes [node], the changes of their velocities [node, dim] in m/s, and f/m [node, dim] in m/s²."""
+    """Return the mask of given motion [node, dim], the changes of these velocities [node, dim] in m/s, and f/m [node, dim] in m/s²."""
     loads, nothing = state.loads, torch.zeros_like(state.pos)
     if loads is None:
-        return torch.zeros(state.num_nodes, dtype=torch.bool, device=state.pos.device), nothing, nothing
-    prescribed = torch.from_numpy(loads.prescribed).to(state.pos.device)
+        return torch.zeros_like(nothing, dtype=torch.bool), nothing, nothing
+    prescribed = torch.tensor(loads.prescribed, device=state.pos.device)  # a copy: stored arrays may be read-only
     change = next_velocity(loads, state, scales.frame_dt) - state.vel
     force = nothing if loads.force is None else torch.from_numpy(loads.force[0].astype("float64")).to(state.pos.device)
-    return prescribed, torch.where(prescribed[:, None], change, 0.0), force / state.mass[:, None]
+    return prescribed, torch.where(prescribed, change, 0.0), force / state.mass[:, None]
 
 
 def next_velocity(loads: Loads, state: State, dt: float) -> Tensor:

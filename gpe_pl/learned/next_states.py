@@ -74,9 +74,9 @@ def keep_slow(state: State, new: State, topology: Topology, duration: float) -> 
     before = (state.pos.numpy(), state.vel.numpy(), topology.islands.label.numpy(), topology.islands.is_free.numpy())
     _keep_slow(*before, state.gravity.numpy(), duration, new.pos.numpy(), new.vel.numpy(), history.numpy(), at_frame.numpy())
     if state.loads is not None and given is not None:  # static friction does not stop nodes whose motion is given
-        rows = torch.from_numpy(state.loads.rows)
+        held = torch.from_numpy(state.loads.prescribed)
         for values, moved_as_given in ((new.pos, given[0]), (new.vel, given[1]), (history[:, -1], given[1]), (at_frame, given[1])):
-            values[rows] = moved_as_given[rows]
+            values[held] = moved_as_given[held]
 
 
 def advanced(state: State, acc: Tensor, dt: float) -> State:

@@ -103,5 +103,8 @@ def outside_scales(scene: Metadata, trained: Tensor) -> Iterator[tuple[str, str]
 def named_materials(metadata: Metadata) -> str:
     """Return the materials, the parameters that the data set stores besides the first of each, and its loads."""
     further = sorted(set(metadata.param_names) - set(param_names(metadata.materials)))
-    given = [{"motion": "prescribed nodes", "force": "nodal forces"}[name] for name in metadata.loads or ()]
+    given = [
+        {"motion": "prescribed nodes", "sliding": "nodes held along some axes", "force": "nodal forces"}[name]
+        for name in metadata.loads or ()
+    ]
     return ", ".join(metadata.materials) + (f" with {', '.join((*further, *given))}" if (further or given) else "")

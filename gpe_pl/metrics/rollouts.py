@@ -88,7 +88,7 @@ def displacement(
 
 
 def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.ndarray, "frame"]:
-    """Return the mean squared position error of every frame [m²], over dimensions and over nodes whose motion is not given.
+    """Return the mean squared position error of every frame [m²], over dimensions and over nodes whose motion is not given along all axes.
 
     In open scenes, nodes count that are in both at the frame.
 
@@ -116,7 +116,7 @@ def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.
 
 
 def _computed(ground_truth: Trajectory, values: np.ndarray) -> np.ndarray:
-    """Return the values [frame, node, …] of the nodes that a simulator computes."""
+    """Return the values [frame, node, …] of the nodes that a simulator computes, along one axis at least."""
     return values if ground_truth.prescribed is None else values[:, ground_truth.is_predicted]
 
 

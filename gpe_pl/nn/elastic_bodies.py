@@ -19,8 +19,6 @@ from gpe_pl.nn.elastic_bodies_kernels import move_bodies
 from gpe_pl.nn.elastic_motion import LOGARITHM_SCALE, MAX_SUBSTEPS, STABLE, Cells, Constants, Corners, Walls, cauchy_stress, elastic_motion
 from gpe_pl.system.compiled import is_wanted
 
-HEAVY = 1e9
-"""Mass of nodes whose motion is given, in mean masses. Cells pull at them and do not change their velocity."""
 MAX_CACHED = 64
 """Largest number of graphs whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
 ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "cell_index", "corner_index", "corner")
@@ -112,8 +110,6 @@ class ElasticBodies(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         if "ptr" in data[m]:
             raise CellError("PyTorch Geometric's Batch does not renumber cells; join graphs with gpe_pl.graphs.batching.batched")
-        if "prescribed" in data[m]:
-            acceleration, mass = self._with_given_motion(data, m, acceleration, mass)
         if is_wanted() and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
             return self._moved_at_once(m, data, acceleration, params, mass, with_stress)
         own = data[m].body_pos.new_empty(len(mass), 0) if params is None else params.to(data[m].body_pos.dtype)
@@ -121,6 +117,7 @@ class ElasticBodies(nn.Module):
         # an H200 needs 0.1 to 0.4 s to start the operations of all substeps one by one; the compiled pass on the host takes 1 ms with both copies
         device = torch.device("cpu") if is_wanted() else mass.device
         store = {key: data[m][key].to(device) for key in ENTRIES}
+        held = data[m].prescribed.to(device) if "prescribed" in data[m] else None
         scene = data[m].batch.to(device) if "batch" in data[m] else None
         unit, spacing, friction_factor, forcing = (
             x.to(device) for x in (self.acceleration_unit, self.spacing, self.log_friction[m].exp(), acceleration * self.acceleration_unit)
@@ -136,18 +133,13 @@ class ElasticBodies(nn.Module):
         walls = Walls(normal, gap[:, 0] - self.wall_distance[m].to(device) * spacing, friction[:, 0] * friction_factor)
         ends, corner = store["corner_index"], store["corner"]
         corners = Corners(ends, body_pos.double()[ends[:, 0]] + corner[:, : self.dim], corner[:, self.dim] * friction_factor.detach())
-        way, at_end, law = elastic_motion(body_pos, velocity, forcing + gravity, mass.to(device), (lam, mu, eta), cells, walls, corners)
+        way, at_end, law = elastic_motion(
+            body_pos, velocity, forcing + gravity, mass.to(device), (lam, mu, eta), cells, walls, corners, held
+        )
         stress = None
         if with_stress:
             stress = (cauchy_stress(body_pos + way, law, cells) / self.stress_unit.to(device)).to(acceleration)
         return ((way - mean - gravity) / unit).to(acceleration), at_end.to(mass.device), stress
-
-    def _with_given_motion(self, data: HeteroData, m: str, acceleration: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """Return accelerations and masses with which prescribed nodes keep their velocity in the frame. The graph has the one that takes them where they go."""
-        prescribed = data[m].prescribed
-        gravity = data.gravity[data[m].batch] if "batch" in data[m] else data.gravity
-        still = (-gravity / self.acceleration_unit).to(acceleration)
-        return torch.where(prescribed[:, None], still, acceleration), torch.where(prescribed, HEAVY, mass)
 
     def _moved_at_once(
         self, m: str, data: HeteroData, acceleration: Tensor, params: Tensor | None, mass: Tensor, with_stress: bool
@@ -163,10 +155,11 @@ class ElasticBodies(nn.Module):
         components = 4 if self.dim == 2 else 6
         stress = np.empty((len(mass) if with_stress else 0, components), moved.dtype)
         own = mass.new_empty(len(mass), 0) if params is None else params
+        held = _array(store.prescribed) if "prescribed" in store else np.zeros((0, self.dim), bool)
         entries = (host[key] for key in ("body_pos", "velocity", "wall", "corner_index", "corner"))
         move_bodies(
             _array(own), _array(law["weight"]), _array(law["bias"]), LOGARITHM_SCALE, _array(acceleration), _array(data.gravity),
-            _array(mass_on_host), *map(_array, entries), *cells.arrays, np.array([float(x) for x in units]),
+            _array(mass_on_host), held, *map(_array, entries), *cells.arrays, np.array([float(x) for x in units]),
             (float(MAX_SUBSTEPS), STABLE), moved, at_end, stress,
         )  # fmt: skip
         found, velocity, tensions = (torch.from_numpy(a).to(mass.device) for a in (moved, at_end, stress))

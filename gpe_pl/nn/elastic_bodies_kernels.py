@@ -11,7 +11,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from gpe_pl.nn.elastic_kernels import LOG_SMALLEST, move_forward
+from gpe_pl.nn.elastic_kernels import HEAVY, LOG_SMALLEST, move_forward
 from gpe_pl.trajectory.strain import HEXAHEDRON, POINTS_TO_CORNERS, SMALLEST_RATIO
 
 KEPT = 2
@@ -21,7 +21,7 @@ KEPT = 2
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def move_bodies(
-    params, weight, bias, scale, acceleration, gravity, mass, body_pos, velocity, wall, corner_index, corner, nodes, gradient, volume, rate, cell_start,
+    params, weight, bias, scale, acceleration, gravity, mass, held, body_pos, velocity, wall, corner_index, corner, nodes, gradient, volume, rate, cell_start,
     node_start, units, limits, moved, at_end, stress,
 ):  # fmt: skip
     """Compute the motion of the bodies of one material in all scenes of a graph.
@@ -33,6 +33,7 @@ def move_bodies(
         acceleration: accelerations without gravity by all but cells and walls [node, dim].
         gravity: gravity of each scene [scene, dim] in m/frame².
         mass: masses [node].
+        held: axes along which nodes keep their velocity [node, dim], or without rows if there are none.
         body_pos, velocity, wall, corner_index, corner: entries of the graph, see ``graphs.builder``.
         nodes, gradient, volume, rate: of cells, see ``elastic_motion.Cells``.
         cell_start, node_start: first cell and node of each scene, and their numbers [scene + 1].
@@ -44,15 +45,21 @@ def move_bodies(
     """
     num_nodes, dim = acceleration.shape
     acceleration_unit, spacing, stress_unit, friction_factor, wall_distance = units
-    pos, vel, forcing, weights = np.empty((num_nodes, dim)), np.empty((num_nodes, dim)), np.empty((num_nodes, dim)), np.empty(num_nodes)
+    pos, vel, forcing, weights = (
+        np.empty((num_nodes, dim)),
+        np.empty((num_nodes, dim)),
+        np.empty((num_nodes, dim)),
+        np.empty((num_nodes, dim)),
+    )
     normal, gap, friction = np.empty((num_nodes, dim)), np.empty(num_nodes), np.empty(num_nodes)
     for s in range(len(node_start) - 1):
         for n in range(node_start[s], node_start[s + 1]):
-            weights[n] = mass[n]
             gap[n], friction[n] = max(wall[n, dim] - wall_distance, 0.0), wall[n, dim + 1] * friction_factor
             for a in range(dim):
                 pos[n, a], vel[n, a], normal[n, a] = body_pos[n, a], velocity[n, dim + a], wall[n, a]
-                forcing[n, a] = acceleration[n, a] * acceleration_unit + gravity[s, a]
+                forcing[n, a], weights[n, a] = acceleration[n, a] * acceleration_unit + gravity[s, a], mass[n]
+                if len(held) and held[n, a]:
+                    forcing[n, a], weights[n, a] = 0.0, HEAVY
     point, point_friction = np.empty((len(corner), dim)), np.empty(len(corner))
     for k in range(len(corner)):
         point_friction[k] = corner[k, dim] * friction_factor

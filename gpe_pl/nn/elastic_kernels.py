@@ -15,6 +15,8 @@ from gpe_pl.trajectory.strain import SMALLEST_RATIO
 
 DEEPEST = 0.3
 """Largest depth of a corner in a body, in lengths of the edge. A deeper one lies in front of another edge."""
+HEAVY = 1e9
+"""Mass of nodes along axes along which their motion is given, in mean masses. Cells pull at them and do not change their velocity."""
 LOG_SMALLEST = math.log(SMALLEST_RATIO)
 
 
@@ -174,12 +176,13 @@ def _stop_at_corner(y, velocity, mass, p, mu, a, b, h, contact):
     excess = along - max(height, 0.0) / h
     if excess <= 0.0 or height <= -DEEPEST * length:
         return
-    inverse = (1.0 - place) ** 2 / mass[a] + place**2 / mass[b]
+    mass_a, mass_b = min(mass[a, 0], mass[a, 1]), min(mass[b, 0], mass[b, 1])
+    inverse = (1.0 - place) ** 2 / mass_a + place**2 / mass_b
     t0, t1 = v0 - along * n0, v1 - along * n1
     tangential = math.sqrt(t0 * t0 + t1 * t1)
     stop = min(1.0, mu * excess / max(tangential, 1e-300))
     c0, c1 = excess * n0 + stop * t0, excess * n1 + stop * t1
-    of_a, of_b = (1.0 - place) / (mass[a] * inverse), place / (mass[b] * inverse)
+    of_a, of_b = (1.0 - place) / (mass_a * inverse), place / (mass_b * inverse)
     velocity[a, 0] -= of_a * c0
     velocity[a, 1] -= of_a * c1
     velocity[b, 0] -= of_b * c0
@@ -224,13 +227,13 @@ def move_forward(
             if k == number[s]:
                 for n in range(node_start[s], node_start[s + 1]):
                     for i in range(dim):
-                        last_vel[n, i] = velocity[n, i] + 0.5 * h * (force[n, i] / mass[n] + forcing[n, i])
+                        last_vel[n, i] = velocity[n, i] + 0.5 * h * (force[n, i] / mass[n, i] + forcing[n, i])
                 continue
             weight = 0.5 * h if k == 0 else h
             for n in range(node_start[s], node_start[s + 1]):
                 along, distance, has_wall = 0.0, gap[n], False
                 for i in range(dim):
-                    value = velocity[n, i] + weight * (force[n, i] / mass[n] + forcing[n, i])
+                    value = velocity[n, i] + weight * (force[n, i] / mass[n, i] + forcing[n, i])
                     pushed[now, n, i] = value
                     speed_path[ahead, n, i] = value
                     along += value * normal[n, i]
@@ -435,7 +438,7 @@ def pull_back(
                 for i in range(dim):
                     arriving = weight * grad_vel[n, i]
                     grad_forcing[n, i] += arriving
-                    per_mass[n, i] = arriving / mass[n]
+                    per_mass[n, i] = arriving / mass[n, i]
                     to_pos[n, i] = 0.0
                     to_vel[n, i] = 0.0
             if dim == 2:

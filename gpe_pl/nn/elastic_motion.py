@@ -25,11 +25,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from gpe_pl.nn.elastic_kernels import DEEPEST, LOG_SMALLEST, move_forward, pull_back
+from gpe_pl.nn.elastic_kernels import DEEPEST, HEAVY, LOG_SMALLEST, move_forward, pull_back
 from gpe_pl.nn.fused import works_on
 from gpe_pl.trajectory.strain import HEXAHEDRON, POINTS_TO_CORNERS, SMALLEST_RATIO, shape_gradients
 
@@ -185,6 +185,7 @@ def elastic_motion(
     cells: Cells,
     walls: Walls,
     corners: Corners | None = None,
+    held: Bool[Tensor, "node dim"] | None = None,
 ) -> ElasticMotion:
     """Return the motion over a frame.
 
@@ -197,12 +198,18 @@ def elastic_motion(
         cells: the cells.
         walls: planes that nodes do not enter.
         corners: points that do not pass edges of bodies; None stands for none. Derivatives take the place of their contact on the edge as constant.
+        held: axes along which nodes keep their velocity, whatever acts on them; None stands for none.
     """
     if corners is None:
         corners = Corners(cells.nodes.new_empty(0, 2), pos.new_empty(0, pos.shape[1]), pos.new_empty(0))
     softened, number = _softened_law(pos, law, cells)
+    axis_mass = mass.double()[:, None].expand_as(pos)
+    if held is not None:
+        forcing, axis_mass = torch.where(held, 0.0, forcing), torch.where(held, HEAVY, axis_mass)
     gap = walls.gap.clamp(min=0.0)  # a node behind a plane is not pushed out at once
-    values = [t.double() for t in (pos, vel, forcing, mass, *softened, walls.normal, gap, walls.friction, corners.point, corners.friction)]
+    values = [
+        t.double() for t in (pos, vel, forcing, axis_mass, *softened, walls.normal, gap, walls.friction, corners.point, corners.friction)
+    ]
     move: Any = _Motion.apply if works_on(*values) else plain_motion
     displacement, velocity = move(*values, corners.nodes, cells, number)
     return ElasticMotion(displacement, velocity, softened)
@@ -234,7 +241,8 @@ def plain_motion(
 ) -> tuple[Tensor, Tensor]:
     """Return displacement [m] and last velocity [m/frame] as ``elastic_motion`` does, by PyTorch's operations.
 
-    The arguments are the fields of its arguments. ``number`` has the number of substeps of each scene; a scene with fewer than others stops earlier.
+    The arguments are the fields of its arguments, but ``mass`` is per axis [node, dim]: a node that keeps its velocity along an axis is heavy there.
+    ``number`` has the number of substeps of each scene; a scene with fewer than others stops earlier.
     """
     own = number.repeat_interleave(cells.node_start.diff(), output_size=len(pos))
     step = (1.0 / own.double())[:, None]
@@ -242,7 +250,7 @@ def plain_motion(
     corners = [Corners(pair[some], point[some], point_friction[some]) for some in rounds]
     y, velocity = pos, vel
     for k in range(int(own.max()) + 1 if len(own) else 0):
-        total = forcing + _internal(y, velocity, (lam, mu, eta), cells) / mass[:, None]
+        total = forcing + _internal(y, velocity, (lam, mu, eta), cells) / mass
         half = torch.where(torch.logical_or(own == k, torch.full_like(own, k == 0, dtype=torch.bool)), 0.5, 1.0)[:, None]
         pushed = velocity + half * step * total
         moves = (own > k)[:, None]
@@ -283,7 +291,7 @@ def _stopped_by_corners(velocity: Tensor, y: Tensor, mass: Tensor, corners: Sequ
     for one in corners:
         ends = one.nodes.T
         with torch.no_grad():
-            n, place, least, stop, factors = _corner_contact(y[ends], velocity[ends], one, mass[ends], step[ends[0]])
+            n, place, least, stop, factors = _corner_contact(y[ends], velocity[ends], one, mass.amin(dim=1)[ends], step[ends[0]])
         here = (1 - place) * velocity[ends[0]] + place * velocity[ends[1]]
         along = (here * n).sum(dim=1, keepdim=True)
         change = (along - least) * n + stop * (here - along * n)

@@ -41,5 +41,5 @@ def without_held_bodies(data: HeteroData, materials: Sequence[str], body: Int64[
     if not any("prescribed" in data[m] for m in materials):
         return body
     is_held = body.new_zeros(count + 1, dtype=torch.bool)
-    is_held[body[torch.cat([data[m].prescribed for m in materials])]] = True  # the last entry is that of −1
+    is_held[body[torch.cat([data[m].prescribed.any(dim=1) for m in materials])]] = True  # the last entry is that of −1
     return torch.where(is_held[body], -1, body)

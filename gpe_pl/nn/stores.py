@@ -22,11 +22,14 @@ def contents(data: HeteroData) -> tuple[dict[str, dict[str, Tensor]], dict[EdgeT
 
 
 def predicted_rows(store: Mapping[str, Any], values: Tensor) -> Tensor:
-    """Return the values [node, …] of those nodes of a store that a model has to predict.
+    """Return those values of a store that a model has to predict.
 
-    Nodes whose motion is given are left out, and those of open scenes that have no target.
+    Without given motion, these are the rows of ``values`` [node, …]. With it, they are the components of vectors [node, dim], or the rows of other values of
+    nodes that are not held along all axes. Nodes of open scenes that have no target are left out.
     """
-    masks = [store[name] for name in ("prescribed", "without_target") if name in store]
-    if not masks:
-        return values
-    return values[~(masks[0] if len(masks) == 1 else masks[0] | masks[1])]
+    held, unknown = store.get("prescribed"), store.get("without_target")
+    if held is None:
+        return values if unknown is None else values[~unknown]
+    if values.shape != held.shape:
+        held = held.all(dim=1)
+    return values[~(held if unknown is None else held | unknown.reshape(-1, *[1] * (held.ndim - 1)))]

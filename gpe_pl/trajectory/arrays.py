@@ -203,17 +203,27 @@ def checked_bodies(rigid_body: Any, num_nodes: int) -> np.ndarray:
     return array.astype(np.int32)
 
 
-def checked_prescribed(prescribed: Any, num_nodes: int, rigid_body: np.ndarray | None) -> np.ndarray:
-    """Return a mask [node] of the nodes whose motion is given.
+def checked_prescribed(prescribed: Any, num_nodes: int, dim: int, rigid_body: np.ndarray | None) -> np.ndarray:
+    """Return a mask [node, dim] of the axes along which the motion of nodes is given.
+
+    Args:
+        prescribed: truth values, one per node or one per node and axis.
+        num_nodes: number of nodes.
+        dim: dimension of space.
+        rigid_body: number of the rigid body of each node, −1 for none [node]; None if there are no rigid bodies.
 
     Raises:
-        ArrayError: the values are no truth values, one per node; all nodes are prescribed; or a node of a rigid body is.
+        ArrayError: the values are no truth values, one per node or per node and axis; all nodes are prescribed; or a node of a rigid body is.
     """
-    mask = np.array(flags("prescribed", prescribed, num_nodes, "nodes"))
+    if np.shape(prescribed) == (num_nodes, dim):
+        of_axes = flags("prescribed", np.asarray(prescribed).ravel(), num_nodes * dim, "nodes and axes")
+        mask = np.array(of_axes).reshape(num_nodes, dim)
+    else:
+        mask = np.repeat(np.array(flags("prescribed", prescribed, num_nodes, "nodes"))[:, None], dim, axis=1)
     if mask.all():
         raise ArrayError("prescribed: the motion of all nodes is given, so there is nothing to compute; leave some nodes free")
-    if rigid_body is not None and (mask & (rigid_body >= 0)).any():
-        node = int((mask & (rigid_body >= 0)).argmax())
+    if rigid_body is not None and (is_wrong := mask.any(axis=1) & (rigid_body >= 0)).any():
+        node = int(is_wrong.argmax())
         raise ArrayError(
             f"prescribed: node {node} belongs to rigid body {rigid_body[node]}, whose motion is computed as a whole; "
             "give a rigid body with known motion as boundary=Boundary.moving(…)"

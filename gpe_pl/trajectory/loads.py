@@ -1,7 +1,8 @@
 """``Loads``: what is given of the nodes of a scene, as boundary conditions of a finite-element model are: the motion of some nodes, and forces on nodes.
 
 A prescribed node belongs to its body and to the cells of its mesh. Its positions are given for all frames, so no simulator computes them: ``State.later`` puts
-every prescribed node where it has to be. A clamped node is one whose given position never changes.
+every prescribed node where it has to be. A clamped node is one whose given position never changes. The motion of a node can be given along some axes only, as
+at a plane of symmetry or on rollers; along the others, simulators compute it.
 
 A nodal force f acts on a node of mass m with the acceleration f/m, besides gravity and the forces of neighbours. Tractions and pressures act as nodal forces
 that are integrated over the surface.
@@ -24,8 +25,9 @@ class Loads:
     """Given motion and forces from the present frame on, as NumPy arrays. After their last frame, prescribed nodes stay in place and forces act on.
 
     Attributes:
-        prescribed: whether the motion of each node is given [node].
-        path: positions of the prescribed nodes [frame, prescribed_node, dim] in m. The first frame is the present one.
+        prescribed: whether the motion of each node along each axis is given [node, dim].
+        path: positions of the prescribed nodes [frame, prescribed_node, dim] in m. The first frame is the present one. Components that are not given are
+            those of the present frame.
         force: forces on all nodes [frame, node, dim] in N, each from its frame to the next; None if there are none.
     """
 
@@ -35,8 +37,8 @@ class Loads:
 
     @property
     def rows(self) -> np.ndarray:
-        """Row numbers of the prescribed nodes."""
-        return np.flatnonzero(self.prescribed)
+        """Row numbers of the nodes whose motion is given along some axis."""
+        return np.flatnonzero(self.prescribed.any(axis=1))
 
     def at(self, frame: int) -> Loads:
         """Return the loads ``frame`` frames later."""
@@ -46,8 +48,9 @@ class Loads:
     def take(self, nodes: Array) -> Loads:
         """Return the loads of some nodes, given by row numbers [chosen]."""
         chosen = np.asarray(nodes if isinstance(nodes, np.ndarray) else nodes.cpu())
-        column = np.cumsum(self.prescribed) - 1
-        kept = chosen[self.prescribed[chosen]]
+        is_held = np.asarray(self.prescribed.any(axis=1))
+        column = np.cumsum(is_held) - 1
+        kept = chosen[is_held[chosen]]
         return Loads(self.prescribed[chosen], self.path[:, column[kept]], None if self.force is None else self.force[:, chosen])
 
     @staticmethod
@@ -58,7 +61,7 @@ class Loads:
             return None
         dim, dtype = own[0].path.shape[2], own[0].path.dtype
         whole = [
-            Loads(np.zeros(count, bool), np.zeros((1, 0, dim), dtype)) if part is None else part
+            Loads(np.zeros((count, dim), bool), np.zeros((1, 0, dim), dtype)) if part is None else part
             for part, count in zip(parts, num_nodes, strict=True)
         ]
         force = None
@@ -72,16 +75,19 @@ class Loads:
         return np.asarray(self.path[min(1, len(self.path) - 1)], np.float64)
 
     def at_prescribed(self, given: Array, values: Array) -> Array:
-        """Return values [node, …] that are replaced by those given [node, …] at prescribed nodes; arrays or tensors."""
+        """Return vectors [node, …, dim] whose given components are replaced by those of ``given`` [node, …, dim]; arrays or tensors."""
         xp = array_namespace(values)
         mask = xp.asarray(self.prescribed, device=device(values))
-        return xp.where(mask.reshape(-1, *[1] * (values.ndim - 1)), given, values)
+        return xp.where(mask.reshape(len(self.prescribed), *[1] * (values.ndim - 2), values.shape[-1]), given, values)
 
     def moved(self, start: Array) -> Array:
-        """Return positions [node, dim] in m in which prescribed nodes are where they have to be in the next frame, and others where they are in ``start``."""
+        """Return positions [node, dim] in m in which prescribed nodes are where they have to be in the next frame, and others where they are in ``start``.
+
+        Along axes that are not given, prescribed nodes are also where they are in ``start``.
+        """
         xp = array_namespace(start)
         target = np.zeros(start.shape)
-        target[self.prescribed] = self.next_positions()
+        target[self.rows] = self.next_positions()
         return self.at_prescribed(xp.asarray(target, dtype=start.dtype, device=device(start)), start)
 
 

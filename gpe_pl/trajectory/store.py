@@ -70,7 +70,7 @@ def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
         "rest_pos": trajectory.rest_pos,
         "alive": trajectory.alive,
         "rigid_body": trajectory.rigid_body,
-        "prescribed": trajectory.prescribed,
+        **_stored_prescribed(trajectory.prescribed),
         "force": trajectory.force,
         "cells": trajectory.cells,
         "cell_dim": None if trajectory.cells is None or trajectory.cell_dim is None else [trajectory.cell_dim],
@@ -80,6 +80,21 @@ def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
             arrays[f"{part}_stress"] = getattr(trajectory.stress, part)
             arrays[f"{part}_von_mises"] = getattr(trajectory.stress, f"{part}_von_mises")
     return {k: np.ascontiguousarray(v, dtype=FIELDS[k].dtype) for k, v in arrays.items() if v is not None}
+
+
+def _stored_prescribed(prescribed: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Return the mask [node, dim] of given motion as a field: one value per node where that says all."""
+    if prescribed is None:
+        return {}
+    is_per_node = (prescribed == prescribed[:, :1]).all()
+    return {"prescribed": prescribed[:, 0]} if is_per_node else {"prescribed_axes": prescribed}
+
+
+def _read_prescribed(arrays: dict[str, np.ndarray], dim: int) -> np.ndarray | None:
+    """Return the mask [node, dim] of given motion; None if no motion is given."""
+    if "prescribed_axes" in arrays:
+        return arrays["prescribed_axes"].astype(bool)
+    return np.repeat(arrays["prescribed"].astype(bool)[:, None], dim, axis=1) if "prescribed" in arrays else None
 
 
 def array_bytes(trajectory: Trajectory) -> int:
@@ -423,7 +438,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         boundary,
         rest_pos=arrays.get("rest_pos"),
         rigid_body=arrays.get("rigid_body"),
-        prescribed=arrays["prescribed"].astype(bool) if "prescribed" in arrays else None,
+        prescribed=_read_prescribed(arrays, metadata.dim),
         force=arrays.get("force"),
         cells=arrays.get("cells"),
         cell_dim=int(arrays["cell_dim"][0]) if "cell_dim" in arrays else None,

@@ -210,7 +210,7 @@ class Trajectory:
         alive: mask [frame, node] of the nodes that are in an open scene; None if all are in it in every frame. A node enters and leaves at most once, so its
             number is its identity. Before and after, its position and velocity are those of the nearest frame in which it is in the scene.
         openings: inlets and outlets of an open scene.
-        prescribed: whether the motion of each node is given [node]; ``pos`` has it. None if no motion is given.
+        prescribed: whether the motion of each node along each axis is given [node, dim]; ``pos`` has it. None if no motion is given.
         force: forces on nodes from each frame to the next [frame, node, dim] in N; None if there are none.
         termination: reason why a rollout stopped early; None if it did not.
         start_time: time of the first frame since the start of the scene [s].
@@ -290,8 +290,8 @@ class Trajectory:
             rigid_body: number of the rigid body that each node belongs to [node], −1 for none. Simulators move the nodes of a body by one rigid motion.
             stress: Cauchy stress at the nodes [frame, node, component] in Pa, with the components of ``State.stress``. Models can learn it
                 (``model.stress=true``). Give a material without a stress zeros; it counts as having none.
-            prescribed: whether the motion of each node is given [node], as that of clamped nodes and of nodes that a machine moves. ``pos`` has their
-                positions in all frames. Simulators take these positions, and compute those of the other nodes.
+            prescribed: whether the motion of each node is given [node], as that of clamped nodes and of nodes that a machine moves; or along which axes it
+                is [node, dim], as on rollers and at planes of symmetry. ``pos`` has it in all frames. Simulators take it, and compute the rest.
             force: forces on nodes from each frame to the next [frame, node, dim] in N, or forces that never change [node, dim]. Distribute tractions to the
                 nodes as your finite-element program does. Gravity is not among them, and forces on prescribed nodes have no effect.
             dataset, split: names of data set and split; ``save_dataset`` overrides both.
@@ -336,10 +336,11 @@ class Trajectory:
         if rigid_body is not None:
             rigid_body = checked_bodies(rigid_body, num_nodes)
         if prescribed is not None:
-            prescribed = checked_prescribed(prescribed, num_nodes, rigid_body)
+            prescribed = checked_prescribed(prescribed, num_nodes, dim, rigid_body)
         if force is not None:
             force = checked_force(force, pos.shape)
-        loads = tuple(name for name, given in zip(LOADS, (prescribed, force), strict=True) if given is not None and given.any())
+        sliding = None if prescribed is None else prescribed.any(axis=1) & ~prescribed.all(axis=1)
+        loads = tuple(name for name, given in zip(LOADS, (prescribed, sliding, force), strict=True) if given is not None and given.any())
         return cls(
             Metadata(
                 dataset, names, stored, frame_dt, spacing, radius, bounds, tuple(map(float, gravity)),
@@ -372,15 +373,19 @@ class Trajectory:
 
     @property
     def is_predicted(self) -> np.ndarray:
-        """Mask of the nodes that simulators compute, whose motion is not given [node]."""
-        return np.ones(self.num_nodes, bool) if self.prescribed is None else ~self.prescribed
+        """Mask of the nodes that simulators compute, whose motion is not given along all axes [node]."""
+        return np.ones(self.num_nodes, bool) if self.prescribed is None else np.asarray(~self.prescribed.all(axis=1))
 
     def loads_at(self, frame: int) -> Loads | None:
         """Return the loads from a frame on; None if there are none."""
         if self.prescribed is None and self.force is None:
             return None
-        prescribed = ~self.is_predicted
-        return Loads(prescribed, self.pos[frame:, prescribed], None if self.force is None else self.force[frame:])
+        prescribed = np.zeros(self.pos.shape[1:], bool) if self.prescribed is None else self.prescribed
+        rows = prescribed.any(axis=1)
+        path = self.pos[frame:, rows]
+        if not prescribed[rows].all():
+            path = np.where(prescribed[rows], path, path[:1])  # what is not given is nothing that a simulator may know
+        return Loads(prescribed, path, None if self.force is None else self.force[frame:])
 
     def state(self, frame: int, history: int = 0) -> State:
         """Return the state at a frame.

@@ -65,7 +65,7 @@ KEYS = (
 )
 PREFIXES = ("params_", "cells_")
 """Prefixes of keys, followed by a material or a kind of cells."""
-PER_NODE = ("frame_dt", "materials", "mass", "bounds", "periodic", "gravity", "spacing", "connectivity_radius", "prescribed")
+PER_NODE = ("frame_dt", "materials", "mass", "bounds", "periodic", "gravity", "spacing", "connectivity_radius")
 """Keys with at most one value per node, or ``FEW`` values for the scene. Keys that begin with ``params_`` belong to them too."""
 FEW = 6
 """Maximum number of values that describe a scene."""

@@ -10,12 +10,13 @@ What becomes of the deck and the results:
 - ``S`` becomes the stress at nodes.
 - Linear solid elements C3D4, C3D6 and C3D8 become cells, and their nodes are ``solid``, or as ``materials={1: elastomer}`` says by number of the material.
 - ``*ELASTIC`` and ``*DENSITY`` become Young's modulus, Poisson's ratio and masses of nodes. A cell gives each corner an equal part of its mass.
-- ``*BOUNDARY`` along all axes, with or without a motion, becomes nodes whose motion is given.
+- ``*BOUNDARY``, with or without a motion, becomes nodes whose motion is given along these axes.
 - ``*CLOAD`` with its amplitude becomes forces on nodes. The force of a frame is the mean of the forces at its two ends.
+- ``*DLOAD`` and ``*DSLOAD`` of pressures on faces become forces on nodes, too. With ``NLGEOM``, pressures follow the deformation: forces are those on the faces
+  as they are in the results. Without it, they are those on undeformed faces.
 - ``*DLOAD`` with ``GRAV`` becomes gravity.
 
 Units are those of the deck, which have to be SI units. The first frame is the time before the first result, in which everything is at rest and free of stress.
-Nodes that are held along some axes only are computed like free nodes, and a warning says so.
 """
 
 from __future__ import annotations
@@ -100,11 +101,9 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
         if elastic is not None:
             nodes.parameters = {**nodes.parameters, material: dict(zip((p.name for p in MATERIALS[material]), elastic, strict=False))}
     held = [conditions.held.get(int(node), set()) for node in results.node_ids]
-    prescribed = np.array([axes == {1, 2, 3} for axes in held])
-    if partly := sum(bool(axes) and axes != {1, 2, 3} for axes in held):
-        nodes.warnings.append(f"{partly} nodes are held along some axes only; they are computed like free nodes")
+    prescribed = np.array([[axis in axes for axis in (1, 2, 3)] for axes in held])
     nodes.prescribed = prescribed if prescribed.any() else None
-    force = conditions.force(results.node_ids, times)
+    force = conditions.force(results.node_ids, times, results.rest_pos, pos)
     nodes.force = None if force is None else (force + np.concatenate([force[1:], force[-1:]])) / 2
     if (velocity := _frames(results, "VELO", count)) is not None:
         nodes.vel = np.concatenate([np.zeros((1, *velocity.shape[1:])), velocity])

@@ -1,4 +1,4 @@
-"""Reader of input decks of Abaqus and CalculiX (``*.inp``): materials, held nodes, and forces on nodes as functions of time.
+"""Reader of input decks of Abaqus and CalculiX (``*.inp``): materials, held nodes, and forces and pressures as functions of time.
 
 Only what a trajectory needs is read. Meshes and results come from the result file.
 """
@@ -11,13 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
+from gpe_pl.data.importers.pressures import CORNERS, FACES, corner_areas, kind_of
 from gpe_pl.data.importers.source import Refusal
 
+Amplitude = tuple[np.ndarray, np.ndarray]
+"""Times [s] and factors of a load."""
+Face = tuple[int, ...]
+"""Numbers of the nodes of a face."""
 Card = tuple[str, dict[str, str], list[list[str]]]
 """Keyword, parameters in upper case, and data lines of a card."""
 
-LOADS = ("DLOAD", "DSLOAD", "PRESSURE", "DFLUX")
-HOLDING = {"ENCASTRE": (1, 3), "PINNED": (1, 3)}
+LOADS = ("PRESSURE", "DFLUX")
+HOLDING = {"ENCASTRE": (1, 3), "PINNED": (1, 3), "XSYMM": (1, 1), "YSYMM": (2, 2), "ZSYMM": (3, 3)}
 """Named boundary conditions, as the first and last held axis."""
 
 
@@ -28,27 +33,51 @@ class Deck:
     Attributes:
         density, elastic: density, and Young's modulus with Poisson's ratio, by the name of the material in upper case.
         held: held axes, 1 to 3, by the number of the node.
-        forces: amplitude ([time], [factor]) or None for a constant load, and magnitudes by (node, axis), of each card.
+        forces: amplitude, or None for a constant load, and magnitudes by (node, axis), of each card.
+        pressures: amplitude, or None, and pressures by face, of each card.
         gravity: acceleration [3]; None if there is no gravity.
+        follows: whether pressures follow the deformation (``NLGEOM``).
     """
 
     density: dict[str, float] = field(default_factory=dict)
     elastic: dict[str, tuple[float, float]] = field(default_factory=dict)
     held: dict[int, set[int]] = field(default_factory=dict)
-    forces: list[tuple[tuple[np.ndarray, np.ndarray] | None, dict[tuple[int, int], float]]] = field(default_factory=list)
+    forces: list[tuple[Amplitude | None, dict[tuple[int, int], float]]] = field(default_factory=list)
+    pressures: list[tuple[Amplitude | None, list[tuple[Face, float]]]] = field(default_factory=list)
     gravity: np.ndarray | None = None
+    follows: bool = False
 
-    def force(self, node_ids: np.ndarray, times: np.ndarray) -> np.ndarray | None:
-        """Return the forces on nodes at times [frame, node, 3]; None if there are none."""
-        if not self.forces:
+    def force(self, node_ids: np.ndarray, times: np.ndarray, rest_pos: np.ndarray, pos: np.ndarray) -> np.ndarray | None:
+        """Return the forces on nodes at times [frame, node, 3] in N; None if there are none.
+
+        Args:
+            node_ids: numbers of the nodes [node].
+            times: times [frame] in s.
+            rest_pos: undeformed positions [node, 3] in m.
+            pos: positions at the times [frame, node, 3] in m. Pressures act on the faces there if they follow the deformation, otherwise on undeformed faces.
+        """
+        if not self.forces and not self.pressures:
             return None
         row = {int(node): k for k, node in enumerate(node_ids)}
         total = np.zeros((len(times), len(node_ids), 3))
         for amplitude, values in self.forces:
-            factor = np.ones(len(times)) if amplitude is None else np.interp(times, *amplitude)
+            factor = _factors(amplitude, times)
             for (node, axis), magnitude in values.items():
                 if node in row:
                     total[:, row[node], axis - 1] += factor * magnitude
+        shape = pos if self.follows else np.broadcast_to(rest_pos, pos.shape)
+        for amplitude, loaded in self.pressures:
+            for count in (3, 4):
+                faces = [(face, pressure) for face, pressure in loaded if len(face) == count]
+                if faces:
+                    missing = next((node for face, _ in faces for node in face if node not in row), None)
+                    if missing is not None:
+                        raise Refusal(f"node {missing} has a pressure in the deck and is not in the results")
+                    rows = np.array([[row[node] for node in face] for face, _ in faces])
+                    pressure = _factors(amplitude, times)[:, None] * np.array([own for _, own in faces])
+                    forces = pressure[..., None, None] * corner_areas(shape[:, rows])
+                    for frame, own in zip(total, forces, strict=True):
+                        np.add.at(frame, rows.ravel(), own.reshape(-1, 3))
         return total
 
 
@@ -56,18 +85,20 @@ def read(path: Path) -> Deck:
     """Read a deck.
 
     Raises:
-        Refusal: the file is missing or no deck; it has several steps, includes other files, or has pressures or other distributed loads besides gravity.
+        Refusal: the file is missing or no deck; it has several steps, includes other files, or has distributed loads besides gravity and pressures.
     """
     try:
         text = path.read_text(encoding="ascii", errors="replace")
     except FileNotFoundError:
         raise Refusal(f"{path.name} is missing beside the results") from None
-    deck, sets, amplitudes, material = Deck(), dict[str, list[int]](), dict[str, tuple[np.ndarray, np.ndarray]](), ""
-    num_steps = 0
+    deck, sets, amplitudes, material = Deck(), dict[str, list[int]](), dict[str, Amplitude](), ""
+    elements, num_steps = _Elements(), 0
     for keyword, parameters, lines in _cards(text):
         try:
             if keyword in ("NODE", "NSET") and "NSET" in parameters:
-                sets.setdefault(parameters["NSET"], []).extend(_members(keyword, parameters, lines, sets))
+                sets.setdefault(parameters["NSET"], []).extend(_members(keyword == "NODE", parameters, lines, sets, "nodes"))
+            elif keyword in ("ELEMENT", "ELSET", "SURFACE"):
+                elements.add(keyword, parameters, lines)
             elif keyword == "AMPLITUDE":
                 numbers = np.array([float(x) for line in lines for x in line])
                 amplitudes[parameters["NAME"]] = numbers[0::2], numbers[1::2]
@@ -82,15 +113,25 @@ def read(path: Path) -> Deck:
                     deck.held.setdefault(node, set()).update(axes)
             elif keyword == "CLOAD":
                 deck.forces.append((_amplitude(parameters, amplitudes), dict(_loaded(lines, sets))))
-            elif keyword == "DLOAD" and all(line[1].upper() == "GRAV" for line in lines):
-                strength, *way = (float(x) for x in lines[0][2:6])
-                deck.gravity = strength * np.array(way)
+            elif keyword in ("DLOAD", "DSLOAD"):
+                loaded = list[tuple[Face, float]]()
+                for place, label, *values in lines:
+                    if label.upper() == "GRAV":
+                        strength, *way = (float(x) for x in values[:4])
+                        deck.gravity = strength * np.array(way)
+                    else:
+                        loaded += [(face, float(values[0])) for face in elements.faces(keyword, place, label.upper())]
+                if loaded:
+                    deck.pressures.append((_amplitude(parameters, amplitudes), loaded))
             elif keyword in LOADS:
-                raise Refusal(f"{path.name}: *{keyword} is a distributed load; give forces on nodes as *CLOAD")
+                raise Refusal(f"{path.name}: *{keyword} is not read; give forces as *CLOAD and pressures as *DLOAD or *DSLOAD")
+            elif keyword == "TRANSFORM":
+                raise Refusal(f"{path.name}: *TRANSFORM; give held axes and forces along the global axes")
             elif keyword == "INCLUDE":
                 raise Refusal(f"{path.name}: *INCLUDE; write the whole deck into one file")
             elif keyword == "STEP":
                 num_steps += 1
+                deck.follows = "NLGEOM" in parameters and parameters["NLGEOM"] != "NO"
         except (ValueError, IndexError, KeyError) as error:
             raise Refusal(f"{path.name}: *{keyword} cannot be read ({error})") from None
     if num_steps != 1:
@@ -124,39 +165,103 @@ def _parameters(parts: list[str]) -> dict[str, str]:
     return {name.strip().upper(): value.strip().upper() for name, _, value in pairs}
 
 
-def _members(keyword: str, parameters: dict[str, str], lines: list[list[str]], sets: dict[str, list[int]]) -> Iterator[int]:
+@dataclass
+class _Elements:
+    """Elements of a deck.
+
+    Attributes:
+        kind: kind of each element of linear solids, a key of ``FACES``, by its number.
+        nodes: numbers of its nodes.
+        sets: numbers of elements by the names of sets.
+        surfaces: faces by the names of surfaces.
+    """
+
+    kind: dict[int, str] = field(default_factory=dict)
+    nodes: dict[int, list[int]] = field(default_factory=dict)
+    sets: dict[str, list[int]] = field(default_factory=dict)
+    surfaces: dict[str, list[Face]] = field(default_factory=dict)
+
+    def add(self, keyword: str, parameters: dict[str, str], lines: list[list[str]]) -> None:
+        """Add a card *ELEMENT, *ELSET or *SURFACE."""
+        if keyword == "SURFACE":
+            if parameters.get("TYPE", "ELEMENT") == "ELEMENT":
+                own = self.surfaces.setdefault(parameters["NAME"], [])
+                own.extend(face for place, label, *_ in lines for face in self._of_elements(place, label.upper().replace("S", "P", 1)))
+        elif keyword == "ELSET":
+            self.sets.setdefault(parameters["ELSET"], []).extend(_members(False, parameters, lines, self.sets, "elements"))
+        elif (kind := kind_of(parameters["TYPE"])) is not None:
+            width = 1 + CORNERS[kind]
+            numbers = np.array([int(x) for line in lines for x in line]).reshape(-1, width)
+            self.kind.update(dict.fromkeys(numbers[:, 0].tolist(), kind))
+            self.nodes.update(zip(numbers[:, 0].tolist(), numbers[:, 1:].tolist(), strict=True))
+            if "ELSET" in parameters:
+                self.sets.setdefault(parameters["ELSET"], []).extend(numbers[:, 0].tolist())
+
+    def faces(self, keyword: str, place: str, label: str) -> list[Face]:
+        """Return the faces on which a line of *DLOAD or *DSLOAD acts.
+
+        Raises:
+            ValueError: the load is no pressure on known faces of linear solid elements.
+        """
+        if keyword == "DLOAD":
+            return self._of_elements(place, label)
+        if label != "P":
+            raise ValueError(f"{label} is no pressure; give forces on nodes as *CLOAD")
+        if place.upper() not in self.surfaces:
+            raise ValueError(f"unknown surface of elements {place!r}")
+        return self.surfaces[place.upper()]
+
+    def _of_elements(self, place: str, label: str) -> list[Face]:
+        if label[:1] != "P" or not label[1:].isdigit():
+            raise ValueError(f"{label} is no pressure on a face P1 to P6; give forces on nodes as *CLOAD")
+        found = list[Face]()
+        for element in _numbers(place, self.sets, "elements"):
+            corners = FACES[self.kind[element]] if element in self.kind else ()
+            if not 1 <= int(label[1:]) <= len(corners):
+                raise ValueError(f"element {element} has no face {label[1:]}" if corners else f"element {element} is no linear solid")
+            found.append(tuple(self.nodes[element][k] for k in corners[int(label[1:]) - 1]))
+        return found
+
+
+def _members(is_table: bool, parameters: dict[str, str], lines: list[list[str]], sets: dict[str, list[int]], what: str) -> Iterator[int]:
+    """Yield the numbers of a set, or those in the first column of a table."""
     for line in lines:
-        if keyword == "NODE":
+        if is_table:
             yield int(line[0])
         elif "GENERATE" in parameters:
             first, last, *step = map(int, line)
             yield from range(first, last + 1, step[0] if step else 1)
         else:
             for name in line:
-                yield from _nodes(name, sets)
+                yield from _numbers(name, sets, what)
 
 
-def _nodes(name: str, sets: dict[str, list[int]]) -> list[int]:
-    """Return the nodes of a set, or the node with a number."""
+def _numbers(name: str, sets: dict[str, list[int]], what: str) -> list[int]:
+    """Return the members of a set, or a number itself."""
     if name.upper() in sets:
         return sets[name.upper()]
     if not name.isdigit():
-        raise ValueError(f"unknown set of nodes {name!r}")
+        raise ValueError(f"unknown set of {what} {name!r}")
     return [int(name)]
+
+
+def _factors(amplitude: Amplitude | None, times: np.ndarray) -> np.ndarray:
+    """Return the factors of a load at times [frame]."""
+    return np.ones(len(times)) if amplitude is None else np.interp(times, *amplitude)
 
 
 def _held(lines: list[list[str]], sets: dict[str, list[int]]) -> Iterator[tuple[int, range]]:
     for name, first, *rest in lines:
         low, high = HOLDING[first.upper()] if not first.isdigit() else (int(first), int(rest[0]) if rest else int(first))
-        for node in _nodes(name, sets):
+        for node in _numbers(name, sets, "nodes"):
             yield node, range(low, min(high, 3) + 1)
 
 
-def _amplitude(parameters: dict[str, str], amplitudes: dict[str, tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray] | None:
+def _amplitude(parameters: dict[str, str], amplitudes: dict[str, Amplitude]) -> Amplitude | None:
     return amplitudes[parameters["AMPLITUDE"]] if "AMPLITUDE" in parameters else None
 
 
 def _loaded(lines: list[list[str]], sets: dict[str, list[int]]) -> Iterator[tuple[tuple[int, int], float]]:
     for name, axis, magnitude in lines:
-        for node in _nodes(name, sets):
+        for node in _numbers(name, sets, "nodes"):
             yield (node, int(axis)), float(magnitude)

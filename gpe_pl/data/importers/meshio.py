@@ -13,7 +13,8 @@ Arrays are found by their names. ``arrays={displacement: U, stress: S}`` names t
   are positions, and displacements lead back to the undeformed positions. Without displacements, points that move are positions.
 - ``velocity`` of points [point, axis] in m/s. Without it, velocities are differences of positions.
 - ``stress`` of points or cells: 6 components in VTK's order XX, YY, ZZ, XY, YZ, XZ, or 9. The stress of a cell goes to its nodes, as the mean by size of cells.
-- ``prescribed`` of points: not 0 where the motion is given, as in the first frame. ``force`` of points [point, axis] in N.
+- ``prescribed`` of points: not 0 where the motion is given, or [point, axis] along which axes it is, as in the first frame.
+- ``force`` of points [point, axis] in N.
 - ``mass`` of points [kg], or ``density`` of points or cells [kg/m³]. Otherwise all masses are 1 kg, which does not suit forces.
 - ``material`` of points: numbers, which ``materials={1: elastomer}`` names. Without it, all have number 0, which is ``solid`` for meshes.
 - Parameters of materials at points or in cells, such as ``youngs_modulus`` and ``poisson_ratio``.
@@ -124,7 +125,8 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
     nodes.force = _vectors(arrays, "force", dim)
     prescribed = arrays.of_points("prescribed")
     if prescribed is not None and prescribed[0].any():
-        nodes.prescribed = prescribed[0].reshape(pos.shape[1], -1).any(axis=1)
+        per_axis = prescribed[0].reshape(pos.shape[1], -1) != 0
+        nodes.prescribed = per_axis[:, :dim] if per_axis.shape[1] > 1 else per_axis[:, 0]
     stress = arrays.at_points("stress", rest)
     if stress is not None:
         stress = stress.reshape(*stress.shape[:2], -1)

@@ -54,5 +54,6 @@ def free_flight_of(trajectory: Trajectory, facts: Facts) -> FreeFlight:
     if facts.bounds is None:
         b = with_walls(m.dim, b, walls_at_bounds(replace(facts, bounds=m.bounds, spacing=m.spacing), m.dim))
     arrays = {"pos": trajectory.pos, "mass": trajectory.mass, "boundary_pos": b.pos[None] if b.motion is None else b.motion.pos}
-    arrays |= {name: values for name in ("cells", "prescribed", "force") if (values := getattr(trajectory, name)) is not None}
+    given = {"cells": trajectory.cells, "prescribed_axes": trajectory.prescribed, "force": trajectory.force}
+    arrays |= {name: values for name, values in given.items() if values is not None}
     return joined(free_flights(trajectory.metadata, arrays, FLIGHT_FRAMES), trajectory.metadata.dim)

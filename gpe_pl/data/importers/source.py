@@ -243,7 +243,7 @@ class Nodes:
         cells: cells of a mesh by kind [cell, corner].
         rest_pos: rest positions of a mesh [node, dim] in m.
         rigid_body: number of the rigid body of each node, −1 for none [node].
-        prescribed: whether the motion of each node is given [node].
+        prescribed: whether the motion of each node is given [node], or along which axes it is [node, dim].
         force: forces on nodes [frame, node, dim] in N.
         stress: Cauchy stress at nodes [frame, node, component] in Pa.
         moving_walls: positions and normals [frame, boundary_node, dim] of additional boundary nodes that move in a prescribed way.

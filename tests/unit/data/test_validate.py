@@ -353,12 +353,12 @@ def falling(new_trajectory: Callable[..., Trajectory], extra: float, gap: float 
     return replace(t, pos=pos.astype(np.float32), vel=vel, cells=cells, rest_pos=rest_pos)
 
 
-@pytest.mark.parametrize("load", ["prescribed", "force"])
+@pytest.mark.parametrize("load", ["prescribed", "prescribed_axes", "force"])
 def test_groups_that_a_load_moves_are_not_in_free_flight(new_trajectory: Callable[..., Trajectory], load: str) -> None:
     t = falling(new_trajectory, 0.1, 0.3)
     arrays = {"pos": t.pos, "vel": t.vel, "mass": t.mass, "boundary_pos": t.boundary.pos[None]}
     pushed = np.array([0, 1, 0])
-    arrays[load] = pushed if load == "prescribed" else np.ones((6, 1, 2)) * pushed[:, None]
+    arrays[load] = {"prescribed": pushed, "prescribed_axes": pushed[:, None] * [0, 1], "force": np.ones((6, 1, 2)) * pushed[:, None]}[load]
     assert [(f.num_free, f.num_disturbed) for f in free_flights(t.metadata, arrays)] == [(1, 0)] * 4
 
 

@@ -83,9 +83,13 @@ def test_peak_stress_is_the_largest_of_all_nodes_and_frames() -> None:
     assert found.over_time.argmax() == 2
 
 
+FIRST = np.array([[True, True], [False, False], [False, False]])
+"""Mask of the first node."""
+
+
 def test_deflection_is_the_way_of_the_node_farthest_from_rest() -> None:
     pos = np.zeros((4, 3, 2)) + np.stack([np.arange(3.0), np.zeros(3)], axis=1)
     pos[2, 2] += (0.3, -0.4)
-    found = quantities(replace(moving(pos, (0.0, 0.0)), prescribed=np.array([True, False, False]), rest_pos=pos[0]))["deflection"]
+    found = quantities(replace(moving(pos, (0.0, 0.0)), prescribed=FIRST, rest_pos=pos[0]))["deflection"]
     assert found.over_time.tolist() == pytest.approx([0.0, 0.5, 0.0]) and found.value == pytest.approx(0.5)
-    assert quantities(replace(moving(pos), prescribed=np.array([True, False, False])))["deflection"].value == pytest.approx(0.5)
+    assert quantities(replace(moving(pos), prescribed=FIRST))["deflection"].value == pytest.approx(0.5)

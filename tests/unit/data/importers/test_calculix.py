@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset
+from gpe_pl.data.importers.pressures import FACES, corner_areas
 from gpe_pl.fit import fit
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
@@ -127,7 +128,7 @@ def test_a_computation_becomes_a_trajectory(tmp_path: Path) -> None:
     assert own.rest_pos is not None and own.cells is not None and own.cell_dim == 3
     np.testing.assert_allclose(own.rest_pos - own.rest_pos[0], POINTS, atol=1e-7)
     assert own.cells.tolist() == CELLS
-    assert own.prescribed is not None and own.prescribed.tolist() == [True] * 4 + [False] * 8
+    assert own.prescribed is not None and own.prescribed.tolist() == [[True] * 3] * 4 + [[False] * 3] * 8
     assert own.metadata.param_names == ("youngs_modulus", "poisson_ratio") and own.metadata.materials == ("solid",)
     np.testing.assert_allclose(own.material_params, np.tile([2e6, 0.4], (12, 1)), rtol=1e-6)
     np.testing.assert_allclose(own.mass, 1200 * SIZE**3 / 8 * np.repeat([1, 2, 1], 4), rtol=1e-6)
@@ -148,19 +149,31 @@ def test_materials_can_be_named_and_constants_given(tmp_path: Path) -> None:
     np.testing.assert_allclose(own.material_params[:, 0], 7e5)
 
 
-def test_nodes_that_are_held_along_some_axes_are_free_and_named(tmp_path: Path) -> None:
-    write(tmp_path / "raw", lambda deck: deck.replace("Clamped, 1, 3\n", "Clamped, 1, 2\nTIP, ENCASTRE\n"))
-    report = import_dataset(tmp_path / "data", ImportSettings("calculix", str(tmp_path / "raw"), "set"))
-    own = next(iter_trajectories(tmp_path / "data" / "set" / "imported", "train"))
-    assert own.prescribed is not None and own.prescribed.tolist() == [False] * 8 + [True] * 4
-    assert any("4 nodes are held along some axes only" in str(event) for event in report.warnings)
+def test_nodes_can_be_held_along_some_axes(tmp_path: Path) -> None:
+    write(tmp_path / "raw", lambda deck: deck.replace("Clamped, 1, 3\n", "Clamped, 1, 2\n109, ZSYMM\nTIP, ENCASTRE\n"))
+    own, *_ = imported(tmp_path)
+    assert own.prescribed is not None
+    assert own.prescribed.tolist() == [[True, True, False]] * 4 + [[False, False, True]] + [[False] * 3] * 3 + [[True] * 3] * 4
+    assert own.metadata.loads == ("motion", "sliding", "force")
 
 
 @pytest.mark.parametrize(
     ("edit", "edit_results", "message"),
     [
         (lambda d: d.replace("*DENSITY\n1200.\n", ""), str, "material RUBBER has no \\*DENSITY"),
-        (lambda d: d.replace("GRAV, 9.81, 0., 0., -1.", "P1, 5."), str, r"\*DLOAD is a distributed load; give forces on nodes as \*CLOAD"),
+        (
+            lambda d: d.replace("GRAV, 9.81, 0., 0., -1.", "BX, 5."),
+            str,
+            "BX is no pressure on a face P1 to P6; give forces on nodes as \\*CLOAD",
+        ),
+        (lambda d: d.replace("BODY, GRAV, 9.81, 0., 0., -1.", "7, P1, 5."), str, "element 7 is no linear solid"),
+        (lambda d: d.replace("*DLOAD\nBODY, GRAV, 9.81, 0., 0., -1.", "*DSLOAD\nTOP, P, 5."), str, "unknown surface of elements 'TOP'"),
+        (
+            lambda d: d.replace("*DLOAD\nBODY, GRAV, 9.81, 0., 0., -1.", "*DFLUX\n1, S1, 5."),
+            str,
+            r"\*DFLUX is not read; .* pressures as \*DLOAD",
+        ),
+        (lambda d: d.replace("*STEP", "*TRANSFORM, NSET=TIP\n1., 0., 0., 0., 1., 0.\n*STEP"), str, r"\*TRANSFORM; give held axes"),
         (lambda d: d + "*STEP\n*END STEP\n", str, "has 2 steps, must have one"),
         (lambda d: d.replace("TIP, 2, -4.", "TOP, 2, -4."), str, r"\*CLOAD cannot be read \(unknown set of nodes 'TOP'\)"),
         (str, lambda r: r.replace("    1    0    1", "    4    0    1"), "element 1 is quadratic or of an unknown type"),
@@ -178,6 +191,60 @@ def test_what_cannot_be_read_is_refused_by_name(
         imported(tmp_path)
 
 
+ELEMENTS = "\n".join(f"{k}, {', '.join(str(IDS[node]) for node in cell)}" for k, cell in enumerate(CELLS, start=1))
+
+
+@pytest.mark.parametrize(
+    "load",
+    [
+        "*DLOAD, AMPLITUDE=RISE\n2, P4, 50.",
+        "*ELSET, ELSET=LAST\n2,\n*DLOAD, AMPLITUDE=RISE\nLAST, P4, 50.",
+        "*SURFACE, NAME=END, TYPE=ELEMENT\n2, S4\n*DSLOAD, AMPLITUDE=RISE\nEND, P, 50.",
+    ],
+)
+@pytest.mark.parametrize("follows", [True, False])
+def test_pressures_become_forces_on_the_nodes_of_the_face(tmp_path: Path, load: str, follows: bool) -> None:
+    """The end of the beam is pushed towards the clamp; on the deformed face if the deck has NLGEOM."""
+
+    def edit(deck: str) -> str:
+        deck = deck.replace("ELSET=BODY\n", f"ELSET=BODY\n{ELEMENTS}\n", 1).replace("*DLOAD\n", f"{load}\n*DLOAD\n")
+        deck = deck.replace("*CLOAD, AMPLITUDE=RISE\nTIP, 2, -4.\n*CLOAD\n117, 1, 0.5\n", "")
+        return deck if follows else deck.replace("NLGEOM,\n", "")
+
+    write(tmp_path / "raw", edit)
+    found = imported(tmp_path)
+    own = found[int(np.argmin([np.abs(t.pos[1] - t.pos[0]).max() for t in found]))]
+    assert own.force is not None and not own.force[:, :8].any()
+    factor = np.array([0.25, 0.75, 1, 1, 1, 1, 1])  # means over frames of a rise within two frames
+    pos = np.concatenate([POINTS[None], POINTS + displacements(1.0)]) if follows else np.repeat(POINTS[None], FRAMES + 1, axis=0)
+    rise = np.array([0, 0.5, 1, 1, 1, 1, 1])[:, None] * 50.0
+    across, up = pos[:, 10] - pos[:, 8], pos[:, 9] - pos[:, 8]  # the face is a parallelogram that moves as a whole
+    at_ends = rise * np.cross(up, across)
+    mean = (at_ends + np.concatenate([at_ends[1:], at_ends[-1:]])) / 2
+    np.testing.assert_allclose(own.force[:, 8:].sum(axis=1), mean, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(own.force[:, 8:], np.repeat(mean[:, None] / 4, 4, axis=1), rtol=1e-4, atol=1e-7)
+    if not follows:
+        np.testing.assert_allclose(own.force[:, 8, 0], -50.0 * SIZE**2 / 4 * factor, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", FACES)
+def test_a_pressure_on_all_faces_moves_no_element_and_does_the_work_of_its_volume(kind: str) -> None:
+    """Forces on a closed surface add up to nothing, turn nothing, and Σ f · x = −3 p V."""
+    unit = {
+        "C3D4": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        "C3D6": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]],
+        "C3D8": [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]],
+    }[kind]
+    stretched = np.array(unit, float) @ np.array([[1.0, 0.2, 0.1], [0.0, 1.5, -0.3], [0.4, 0.0, 0.7]])
+    force = np.zeros_like(stretched)
+    for face in FACES[kind]:
+        np.add.at(force, list(face), corner_areas(stretched[list(face)][None])[0])
+    volume = {"C3D4": 1 / 6, "C3D6": 1 / 2, "C3D8": 1.0}[kind] * np.linalg.det([[1.0, 0.2, 0.1], [0.0, 1.5, -0.3], [0.4, 0.0, 0.7]])
+    np.testing.assert_allclose(force.sum(axis=0), 0, atol=1e-14)
+    np.testing.assert_allclose(np.cross(stretched, force).sum(axis=0), 0, atol=1e-14)
+    assert (force * stretched).sum() == pytest.approx(-3 * volume)
+
+
 def test_missing_results_are_named(tmp_path: Path) -> None:
     write(tmp_path / "raw")
     for file in (tmp_path / "raw").glob("*.frd"):
@@ -193,9 +260,8 @@ needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is 
 def test_results_of_calculix_itself(tmp_path: Path) -> None:
     """A cube that is clamped at one face and pulled at the other first accelerates by force over mass of its free half."""
     write(tmp_path / "raw")
-    elements = "\n".join(f"{k}, {', '.join(str(IDS[node]) for node in cell)}" for k, cell in enumerate(CELLS, start=1))
     for k, file in enumerate(sorted((tmp_path / "raw").glob("*.inp"))):
-        deck = file.read_text().replace("ELSET=BODY\n", f"ELSET=BODY\n{elements}\n", 1)
+        deck = file.read_text().replace("ELSET=BODY\n", f"ELSET=BODY\n{ELEMENTS}\n", 1)
         deck = deck.replace("TIP, 2, -4.", f"TIP, 2, {-4.0 - k}").replace("U\n*END", "U\n*EL FILE\nS\n*END")
         file.write_text(deck)
         subprocess.run(["ccx", "-i", file.stem], cwd=file.parent, check=True, capture_output=True, timeout=60)
@@ -219,9 +285,9 @@ def decks() -> Any:
 
 @needs_ccx
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["cantilever", "plate"])
+@pytest.mark.parametrize("case", ["cantilever", "plate", "quarter"])
 def test_the_elastic_law_with_true_constants_follows_calculix(tmp_path: Path, case: str) -> None:
-    """Clamps, forces and cells are those of CalculiX, which integrates plain hexahedra implicitly; nothing is trained."""
+    """Clamps, planes of symmetry, forces, pressures and cells are those of CalculiX, which integrates plain hexahedra implicitly; nothing is trained."""
     made = decks()
     (tmp_path / "raw").mkdir()
     chosen = replace(made.CASES[case], element="C3D8", num_frames=25)

@@ -87,7 +87,7 @@ def test_a_series_of_meshio_becomes_a_trajectory(tmp_path: Path, series: str) ->
     np.testing.assert_allclose(found.pos - found.pos[0], displacement(POINTS), atol=1e-6)
     np.testing.assert_allclose(found.vel, 3 * displacement(POINTS), atol=1e-6)
     assert found.cells is not None and found.cells.tolist() == CELLS.tolist() and found.cell_dim == 3
-    assert found.prescribed is not None and found.prescribed.tolist() == [True] * 4 + [False] * 8
+    assert found.prescribed is not None and found.prescribed.tolist() == [[True] * 3] * 4 + [[False] * 3] * 8
     assert found.force is not None and found.stress is not None
     np.testing.assert_allclose(found.force, force(), rtol=1e-6)
     np.testing.assert_allclose(found.mass, DENSITY * SIZE**3 / 8 * np.repeat([1, 2, 1], 4), rtol=1e-5)
@@ -95,6 +95,18 @@ def test_a_series_of_meshio_becomes_a_trajectory(tmp_path: Path, series: str) ->
     of_cells = stress(2)
     at_nodes = np.repeat(np.stack([of_cells[:, 0], of_cells.mean(axis=1), of_cells[:, 1]], axis=1), 4, axis=1)
     np.testing.assert_allclose(found.stress.node, at_nodes[..., VTK], rtol=1e-5)
+
+
+def test_points_can_be_held_along_some_axes(tmp_path: Path) -> None:
+    rollers = np.stack([POINTS[:, 0] == 0, POINTS[:, 1] == 0, np.zeros(len(POINTS))], axis=1)
+
+    def edit(mesh: Any, frame: int) -> Any:
+        mesh.point_data["prescribed"] = rollers.astype(float)
+        return mesh
+
+    write_folder(tmp_path / "raw", edit)
+    found = imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
+    np.testing.assert_array_equal(found.prescribed, rollers)
 
 
 def test_plane_meshes_with_points_that_move_and_nodes_with_stress(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def test_states_forces_and_clamps(tmp_path: Path) -> None:
     np.testing.assert_allclose(trajectory.pos[1:] - trajectory.pos[1, :1], own[..., :3] - own[0, :1, :3], atol=1e-5)
     np.testing.assert_allclose((trajectory.pos[1] - trajectory.pos[0]) / DT, own[0, :, 3:6], atol=1e-4)
     np.testing.assert_array_equal(trajectory.vel[1:], own[..., 3:6])
-    np.testing.assert_array_equal(trajectory.prescribed, CLAMPED)
+    np.testing.assert_array_equal(trajectory.prescribed, np.repeat(CLAMPED[:, None], 3, axis=1))
     np.testing.assert_allclose(
         trajectory.force[1:4, REST[:, 0] == 4, 1], load / 3 * np.array([[1.0], [2.0], [3.0]]) * np.ones(4), rtol=1e-6
     )
