@@ -52,7 +52,14 @@ def skip_described_fields(app: Any, what: str, name: str, obj: Any, skip: bool, 
     return True if isinstance(obj, _tuplegetter) else None
 
 
+def collapse_navigation(app: Any, pagename: str, templatename: str, context: dict[str, Any], doctree: Any) -> None:
+    """Expand only the branch of the current page in the navigation. The theme would write the names of all modules on every page."""
+    if whole := context.get("toctree"):
+        context["toctree"] = lambda **options: whole(**(options | {"collapse": True}))
+
+
 def setup(app: Any) -> None:
     """Connect the functions above. Sphinx calls this."""
     app.connect("autodoc-skip-member", skip_described_fields)
     app.connect("autodoc-process-docstring", escape_bars, priority=400)  # before napoleon converts it to reStructuredText
+    app.connect("html-page-context", collapse_navigation, priority=400)  # before the theme takes the tree of pages
