@@ -21,6 +21,10 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.state import State
 
 
+INDUCTOR = {"aot_inductor.precompile_headers": False}
+"""Settings of the compiler. To compile headers beforehand takes longer than it saves for one program, and 300 MB on the disk."""
+
+
 class CompiledProgramError(GpeError):
     """Raised when a compiled program moves nodes elsewhere than its model."""
 
@@ -47,7 +51,7 @@ def export_compiled(simulator: LearnedSimulator, path: Path | str, states: Seque
         plain, compiled = Path(folder) / "plain.pt2", Path(folder) / "compiled.pt2"
         export_model(simulator, plain)
         inductor = torch._inductor
-        inductor.aoti_compile_and_package(torch.export.load(plain), package_path=str(compiled))
+        inductor.aoti_compile_and_package(torch.export.load(plain), package_path=str(compiled), inductor_configs=INDUCTOR)
         step = inductor.aoti_load_package(str(compiled))
         found = 0.0
         for state, scene in zip(states, scenes, strict=True):

@@ -64,7 +64,7 @@ def test_a_compiled_program_that_differs_is_not_written(tmp_path: Path, monkeypa
 
     class Inductor:
         @staticmethod
-        def aoti_compile_and_package(program: object, package_path: str) -> None:
+        def aoti_compile_and_package(program: object, package_path: str, inductor_configs: object) -> None:
             Path(package_path).write_bytes(b"program")
 
         @staticmethod

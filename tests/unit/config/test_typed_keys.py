@@ -58,7 +58,7 @@ def test_what_is_read_is_not(beside: str, typed: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize("experiment", [pytest.param(e, marks=pytest.mark.long if e.startswith("tuning") else ()) for e in EXPERIMENTS])
 def test_with_the_papers_recipe_too_an_axis_changes_something_or_is_refused(experiment: str) -> None:
     params: dict[str, Any] = unresolved(f"experiment={experiment}", hydra_config=True).hydra.sweeper.params or {}
     axes = [[f"{key}={value}" for value in str(values).split(",")] for key, values in params.items() if key != "seed"]
