@@ -43,6 +43,7 @@ PICTURES = (
     *("long_horizon_*.png", "perturbation_*.png", "cost_error_*.png"),
     "engines.png",
     "bands.png",
+    "active.png",
     "channel.png",
     *("acceptance_fem_beam.png", "acceptance_elastomer_square.png", "acceptance_sand_column.png"),
     "scenes/*_00_misfit.png",

@@ -10,8 +10,8 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpe_pl.config.datasets import AUTOMATIC_BYTES, check_without_stride, dataset_spec
-from gpe_pl.config.entry_point import ConfigError, entry_point
+from gpe_pl.config.datasets import AUTOMATIC_BYTES, candidate_spec, check_without_stride, dataset_spec
+from gpe_pl.config.entry_point import ConfigError, construct, entry_point
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -28,6 +28,7 @@ def simulate(cfg: DictConfig) -> None:
     if not (isinstance(cfg.num_parts, int) and isinstance(cfg.part, int) and 0 <= cfg.part < cfg.num_parts):
         raise ConfigError(f"part={cfg.part!r}, num_parts={cfg.num_parts!r}: must be integers with 0 <= part < num_parts")
     check_without_stride(cfg)
+    _choose_scenes(cfg)
     spec, num_workers = dataset_spec(cfg), cfg.num_workers or os.cpu_count() or 1
     part = (cfg.part, cfg.num_parts)
     with nullcontext() if is_complete(cfg.paths.data, spec, part) else written(cfg.paths.data, spec, part):
@@ -35,6 +36,29 @@ def simulate(cfg: DictConfig) -> None:
     for path in (folder / CONTACT_SHEET_FILE, folder):
         if path.exists():  # only the first part draws the sheet
             print(path)
+
+
+def _choose_scenes(cfg: DictConfig) -> None:
+    """Let the models of ``active.models`` choose the training scenes that the data set lacks."""
+    from gpe_pl.data.generation import written
+    from gpe_pl.evaluation.active import ActiveSettings, choose
+    from gpe_pl.system.progress import progress_bar
+
+    settings = construct(ActiveSettings, cfg.active, "active")
+    if settings.models is None:
+        return
+    if cfg.num_parts > 1:
+        raise ConfigError("active.models: choose scenes with num_parts=1; parts can simulate them afterwards, without active.models")
+    pool = candidate_spec(cfg, settings.num_candidates)
+    with written(cfg.paths.data, pool), progress_bar(f"{pool.name} {pool.size} candidates") as on_progress:
+        choice = choose(cfg.paths.data, pool, cfg.data.num_train, settings, on_progress)
+    if choice is None:
+        print(f"{pool.name} {pool.size}: has {cfg.data.num_train} training scenes; nothing to choose")
+        return
+    print(
+        f"{pool.name} {pool.size}: chose scenes {', '.join(map(str, choice.scenes))}, in which the models are {min(choice.spread):.3g} to "
+        f"{max(choice.spread):.3g} spacings apart (median of all candidates: {choice.median_spread:.3g})"
+    )
 
 
 def _simulate(root: str, spec: DatasetSpec, part: tuple[int, int], num_workers: int) -> Path:

@@ -74,6 +74,24 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     Raises:
         ConfigError: the data set does not have the size, or a setting of the data, the scene or the solver is not allowed. The message names key and value.
     """
+    from gpe_pl.data.chosen_scenes import read
+
+    folder = dataset_folder(cfg)
+    chosen = [number for choice in read(folder) for number in choice.scenes] or None
+    if chosen is not None and len(chosen) != cfg.data.num_train:
+        raise ConfigError(
+            f"data.num_train={cfg.data.num_train}: models chose {len(chosen)} training scenes of {folder}; set data.num_train={len(chosen)}, "
+            "or choose more with `python -m gpe_pl.simulate` and active.models"
+        )
+    return _spec(cfg, train_scenes=chosen)
+
+
+def dataset_folder(cfg: DictConfig) -> Path:
+    """Return the folder of a generated data set, which need not exist."""
+    return Path(cfg.paths.data) / data_name(cfg.data.name, "data.name") / str(cfg.size.name)
+
+
+def _spec(cfg: DictConfig, **replaced: Any) -> DatasetSpec:
     from omegaconf import OmegaConf
 
     from gpe_pl.data.ground_truth import DatasetSpec
@@ -87,7 +105,12 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
         values.pop(key, None)
     scene = construct_target(values.pop("scene"), "data.scene", "gpe_pl.solvers.")
     solver = construct_target(values.pop("solver"), "data.solver", "gpe_pl.solvers.")
-    return construct(DatasetSpec, values, "data", scene=scene, solver=solver)
+    return construct(DatasetSpec, {**values, **replaced}, "data", scene=scene, solver=solver)
+
+
+def candidate_spec(cfg: DictConfig, num_candidates: int) -> DatasetSpec:
+    """Return the data set with all candidates for a choice as its training scenes. Errors are those of ``dataset_spec``."""
+    return _spec(cfg, num_train=num_candidates)
 
 
 def dataset(*overrides: str) -> DatasetSpec:
@@ -161,7 +184,7 @@ def ensure_split(cfg: DictConfig, split: str) -> Path:
     """
     from omegaconf import OmegaConf
 
-    from gpe_pl.data.generation import SPEC_FILE
+    from gpe_pl.data.chosen_scenes import SPEC_FILE
 
     if (
         cfg.data.size != IMPORTED

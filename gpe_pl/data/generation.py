@@ -5,6 +5,7 @@ stopped, and its files equal those of an uninterrupted run. A shard that can be 
 
     {root}/{name}/{size}/dataset.json            the spec and its checksum, written first
     {root}/{name}/{size}/{split}/shard-00000.h5
+    {root}/{name}/{size}/chosen_scenes.json      numbers of training scenes that models chose, if they did (see ``chosen_scenes``)
     {root}/{name}/{size}/statistics.json         statistics of the train split, written when all its shards exist
     {root}/{name}/{size}/contact_sheet.png       one scene with several parameter values, for inspection
 """
@@ -26,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.data.checksum import split_checksum
+from gpe_pl.data.chosen_scenes import SPEC_FILE, scene_numbers
 from gpe_pl.data.ground_truth import DatasetSpec, GenerationError, generate_trajectory, initial_state
 from gpe_pl.data.position_rounding import ROUNDING_FRACTION, motion_of, rounding_fault, rounding_of
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
@@ -42,7 +44,6 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
-SPEC_FILE = "dataset.json"
 CONTACT_SHEET_FILE = "contact_sheet.png"
 SHEET_ROWS = 5
 
@@ -373,25 +374,42 @@ def _labelled_trajectory(spec: DatasetSpec, index: int, label: str, values: dict
 
 
 def _claim(folder: Path, spec: DatasetSpec) -> None:
-    """Write the spec into the folder, or check that the existing one is the same; also check that no link leads out of the folder."""
+    """Write the spec into the folder, or check that the existing one is the same or has fewer chosen scenes; check that no link leads out of the folder."""
     refuse_links(folder)
     path, values = folder / SPEC_FILE, spec.as_dict()
-    if not path.is_file():
-        if any(folder.glob("*/shard-*.h5")):
-            raise GenerationError(f"{folder}: holds shards but no {SPEC_FILE}; delete the folder, or choose another name or size")
+    if not path.is_file() and any(folder.glob("*/shard-*.h5")):
+        raise GenerationError(f"{folder}: holds shards but no {SPEC_FILE}; delete the folder, or choose another name or size")
+    if not path.is_file() or _stored(folder, values) != values:
         _write_json(path, {"spec": values, "sha256": sealed.checksum(values)})
-        return
-    advice = f"delete the folder {folder} and run simulate again"
+
+
+def stored_scenes(root: Path | str, spec: DatasetSpec) -> list[int]:
+    """Return the numbers of the training scenes of the stored data set; none if there is no data set.
+
+    Raises:
+        GenerationError: the folder holds a data set that differs from ``spec`` in more than its training scenes.
+    """
+    folder = Path(root) / spec.name / spec.size
+    return scene_numbers(_stored(folder, spec.as_dict(), any_scenes=True)) if (folder / SPEC_FILE).is_file() else []
+
+
+def _stored(folder: Path, wanted: dict[str, Any], any_scenes: bool = False) -> dict[str, Any]:
+    """Return the stored spec of a folder. It equals ``wanted``, apart from training scenes that were chosen later, or apart from all training scenes."""
+    path, advice = folder / SPEC_FILE, f"delete the folder {folder} and run simulate again"
     try:
         stored = sealed.parsed(path, advice)
     except sealed.SealError as error:
         raise GenerationError(str(error)) from None
     if not (isinstance(stored, dict) and isinstance(stored.get("spec"), dict)):
         raise GenerationError(f"{path}: unreadable, it does not describe a data set; {advice}")
-    differing = _differences(stored["spec"], values)
-    if not differing and stored.get("sha256") != sealed.checksum(values):
+    spec: dict[str, Any] = stored["spec"]
+    before, chosen = scene_numbers(spec), wanted.get("train_scenes")
+    has_grown = any_scenes or (chosen is not None and chosen[: len(before)] == before)
+    ignored = ("num_train", "train_scenes") if has_grown else ()
+    differing = _differences(*({key: value for key, value in own.items() if key not in ignored} for own in (spec, wanted)))
+    if not differing and stored.get("sha256") != sealed.checksum(spec):
         raise GenerationError(f"{path}: was changed or damaged since it was written (checksum mismatch); {advice}")
-    made_by, now = (spec["solver"] if isinstance(spec.get("solver"), dict) else {} for spec in (stored["spec"], values))
+    made_by, now = (own["solver"] if isinstance(own.get("solver"), dict) else {} for own in (spec, wanted))
     if made_by.get("name") == now.get("name") and made_by.get("version") != now.get("version"):
         raise GenerationError(
             f"{folder}: holds data of version {made_by.get('version')} of the solver {now['name']}; this is version {now['version']}, whose trajectories "
@@ -402,6 +420,7 @@ def _claim(folder: Path, spec: DatasetSpec) -> None:
             f"{folder}: holds a data set with other settings: {'; '.join(differing[:5])}. Delete the folder, choose another data set name or size, "
             "or restore these settings"
         )
+    return spec
 
 
 def _differences(stored: Any, wanted: Any, key: str = "") -> list[str]:

@@ -143,6 +143,8 @@ class DatasetSpec:
         num_frames: number of stored frames per trajectory, including the initial one.
         trajectories_per_shard: number of trajectories in a shard, the unit of work and of resuming.
         seed: seed of the data set.
+        train_scenes: numbers of the scenes in ``train``; None takes 0 … num_train - 1. A number stands for a seed and parameter values, as an index does
+            without it. Chosen scenes have such numbers (``chosen_scenes``).
         fine: factor by which the solver divides the spacing of the scene. Above 1, the nodes are tracers of the finer solution (``solvers.finer_solver``).
         scene: distribution of scenes.
         solver: solver that simulates them.
@@ -161,8 +163,11 @@ class DatasetSpec:
     trajectories_per_shard: Annotated[int, Field(ge=1)] = 8
     seed: Annotated[int, Field(ge=0)] = 0
     fine: Literal[1, 2, 4] = 1
+    train_scenes: tuple[Annotated[int, Field(ge=0, le=MOST)], ...] | None = None
 
     def __post_init__(self) -> None:
+        if self.train_scenes is not None and not len({*self.train_scenes}) == len(self.train_scenes) == self.num_train:
+            raise ValueError(f"train_scenes must be num_train = {self.num_train} different numbers, got {len(self.train_scenes)}")
         if self.fine > 1 and not isinstance(self.solver, Refinable):
             raise ValueError(f"fine = {self.fine}: the solver {self.solver.name} has no solution at a finer spacing; use fine = 1")
         scene, solver = asdict(cast(Any, self.scene)), asdict(cast(Any, self.solver))
@@ -249,7 +254,13 @@ class DatasetSpec:
                 del design["further"]
         if self.fine == 1:  # as in the specification of a data set that has no finer labels
             del values["fine"]
+        if self.train_scenes is None:  # as in the specification of a data set whose scenes were not chosen
+            del values["train_scenes"]
         return json.loads(json.dumps({**values, **self.provenance, "input_files": files}))
+
+    def scene_number(self, split: str, index: int) -> int:
+        """Return the number of a scene, from which its seed and its parameter values follow: its index, except in ``train`` with ``train_scenes``."""
+        return index if self.train_scenes is None or split != "train" else self.train_scenes[index]
 
 
 def _settings(solver: Any, named: Solver) -> dict[str, Any]:
@@ -258,7 +269,7 @@ def _settings(solver: Any, named: Solver) -> dict[str, Any]:
 
 def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
     """Return the seed of one scene, which differs for every seed of the data set, split and index."""
-    words = np.random.SeedSequence((spec.seed, SPLITS.index(split), index)).generate_state(2, np.uint32)
+    words = np.random.SeedSequence((spec.seed, SPLITS.index(split), spec.scene_number(split, index))).generate_state(2, np.uint32)
     return int(words[0]) << 32 | int(words[1])
 
 
@@ -273,6 +284,7 @@ def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[st
     therefore unseen if any parameter is, and extrapolated if any parameter is outside the range of its seen values.
     """
     group: ParameterGroup = "seen"
+    index = spec.scene_number(split, index)
     if split == "test_unseen":
         group, index = ("interpolated", "extrapolated")[index % 2], index // 2  # type: ignore[assignment]
     values: dict[str, dict[str, float]] = {}
