@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -76,19 +76,19 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     """
     from gpe_pl.data.chosen_scenes import read
 
-    folder = dataset_folder(cfg)
-    chosen = [number for choice in read(folder) for number in choice.scenes] or None
-    if chosen is not None and len(chosen) != cfg.data.num_train:
+    spec = _spec(cfg)
+    chosen = tuple(number for choice in read(dataset_folder(cfg)) for number in choice.scenes)
+    if chosen and len(chosen) != spec.num_train:
         raise ConfigError(
-            f"data.num_train={cfg.data.num_train}: models chose {len(chosen)} training scenes of {folder}; set data.num_train={len(chosen)}, "
+            f"data.num_train={spec.num_train}: models chose {len(chosen)} training scenes of {dataset_folder(cfg)}; set data.num_train={len(chosen)}, "
             "or choose more with `python -m gpe_pl.simulate` and active.models"
         )
-    return _spec(cfg, train_scenes=chosen)
+    return replace(spec, train_scenes=chosen) if chosen else spec
 
 
 def dataset_folder(cfg: DictConfig) -> Path:
     """Return the folder of a generated data set, which need not exist."""
-    return Path(cfg.paths.data) / data_name(cfg.data.name, "data.name") / str(cfg.size.name)
+    return Path(cfg.paths.data) / str(cfg.data.name) / str(cfg.size.name)
 
 
 def _spec(cfg: DictConfig, **replaced: Any) -> DatasetSpec:

@@ -20,7 +20,6 @@ from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.state import State
 
-
 INDUCTOR = {"aot_inductor.precompile_headers": False}
 """Settings of the compiler. To compile headers beforehand takes longer than it saves for one program, and 300 MB on the disk."""
 
