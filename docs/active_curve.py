@@ -95,9 +95,9 @@ def train(folder: Path, arm: str, seed: int, size: int) -> None:
 
 
 def errors_of(folder: Path, arm: str, size: int, horizon: str) -> list[dict[int, float]]:
-    """Return the errors of each seed by scene: means over the members."""
+    """Return the errors of each finished seed by scene: means over the members."""
     found = []
-    for seed in SEEDS:
+    for seed in finished(folder):
         folders = [folder / "runs" / name for name in names_of(arm, seed, size)]
         runs = [Run(own, {}, table_of(read_rows(own / "metrics.csv"))) for own in folders]
         errors = rollout_errors(runs, "test", horizon)
@@ -105,8 +105,19 @@ def errors_of(folder: Path, arm: str, size: int, horizon: str) -> list[dict[int,
     return found
 
 
+def finished(folder: Path) -> list[int]:
+    """Return the seeds of which all models are evaluated."""
+
+    def is_finished(seed: int) -> bool:
+        names = [name for arm in ARMS for size in SIZES for name in names_of(arm, seed, size)]
+        return all((folder / "runs" / name / "metrics.csv").exists() for name in names)
+
+    return [seed for seed in SEEDS if is_finished(seed)]
+
+
 def report(folder: Path) -> None:
-    """Write table and figure."""
+    """Write table and figure of the finished seeds."""
+    seeds = finished(folder)
     lines = [table_row(["training scenes", "horizon", *(f"{label}: MSE ×1e-3 [m²]" for label in ARMS.values()), "chosen over random"])]
     lines.append("|" + "---|" * 5)
     rows: list[list[str]] = []
@@ -140,7 +151,7 @@ def report(folder: Path) -> None:
     panels[0].legend(fontsize=6, frameon=False)
     lines += [table_row(row) for row in rows]
     note = (
-        f"Means over {len(SEEDS)} seeds and test scenes, with 95 % bootstrap intervals over both. MSE: mean squared displacement over the frames up to the "
+        f"Means over {len(seeds)} seeds and test scenes, with 95 % bootstrap intervals over both. MSE: mean squared displacement over the frames up to the "
         f"horizon. Before a choice, each seed has {MEMBERS} models, afterwards one."
     )
     replace_text(folder / "table.md", "\n".join([*lines, "", note, "", *choices_table(folder), ""]))
@@ -151,14 +162,14 @@ def report(folder: Path) -> None:
         for arm in ARMS:
             for size in SIZES:
                 for horizon in HORIZONS:
-                    for seed, own in zip(SEEDS, errors_of(folder, arm, size, horizon), strict=True):
+                    for seed, own in zip(seeds, errors_of(folder, arm, size, horizon), strict=True):
                         table.writerows([arm, seed, size, horizon, scene, f"{value:.4g}"] for scene, value in own.items())
 
 
 def choices_table(folder: Path) -> list[str]:
     """Return a table of how far models were apart in the scenes that they chose."""
     lines = [table_row(["seed", "training scenes", "median spread of chosen scenes [spacings]", "of all candidates"]), "|" + "---|" * 4]
-    for seed in SEEDS:
+    for seed in finished(folder):
         total = 0
         for choice in chosen_scenes.read(folder / "data" / f"sand_chosen_{seed}" / "tiny"):
             total += len(choice.scenes)
@@ -176,12 +187,12 @@ def main(folder: Path) -> None:
                 simulate(folder, arm, seed, size)
                 if arm == "random" or size > SIZES[0]:
                     train(folder, arm, seed, size)
-    report(folder)
+        report(folder)  # after each seed, because all take long
 
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         sys.exit(__doc__)
     target = Path(sys.argv[1]).resolve()
-    with recorded(target, "active_curve", [], str(target)):
+    with recorded(target, "docs/active_curve.py", ["FOLDER"], str(target)):
         main(target)

@@ -403,16 +403,17 @@ def _stored(folder: Path, wanted: dict[str, Any], any_scenes: bool = False) -> d
     if not (isinstance(stored, dict) and isinstance(stored.get("spec"), dict)):
         raise GenerationError(f"{path}: unreadable, it does not describe a data set; {advice}")
     spec: dict[str, Any] = stored["spec"]
-    before, chosen = scene_numbers(spec), wanted.get("train_scenes")
-    has_grown = any_scenes or (chosen is not None and chosen[: len(before)] == before)
+    known, chosen = scene_numbers(spec), wanted.get("train_scenes")
+    has_grown = any_scenes or (chosen is not None and chosen[: len(known)] == known)
     ignored = ("num_train", "train_scenes") if has_grown else ()
-    differing = _differences(*({key: value for key, value in own.items() if key not in ignored} for own in (spec, wanted)))
+    before, now = ({key: value for key, value in own.items() if key not in ignored} for own in (spec, wanted))
+    differing = _differences(before, now)
     if not differing and stored.get("sha256") != sealed.checksum(spec):
         raise GenerationError(f"{path}: was changed or damaged since it was written (checksum mismatch); {advice}")
-    made_by, now = (own["solver"] if isinstance(own.get("solver"), dict) else {} for own in (spec, wanted))
-    if made_by.get("name") == now.get("name") and made_by.get("version") != now.get("version"):
+    made_by, solver = (own["solver"] if isinstance(own.get("solver"), dict) else {} for own in (spec, wanted))
+    if made_by.get("name") == solver.get("name") and made_by.get("version") != solver.get("version"):
         raise GenerationError(
-            f"{folder}: holds data of version {made_by.get('version')} of the solver {now['name']}; this is version {now['version']}, whose trajectories "
+            f"{folder}: holds data of version {made_by.get('version')} of the solver {solver['name']}; this is version {solver['version']}, whose trajectories "
             "differ. Delete the folder to generate the data again, or choose another data set name"
         )
     if differing:

@@ -38,7 +38,7 @@ def recorded(folder: Path, command: str, arguments: Sequence[str], runs: str) ->
 
     Args:
         folder: folder of the results.
-        command: name of the command, such as ``fit``.
+        command: name of the command, such as ``fit``, or path of a script, such as ``docs/active_curve.py``.
         arguments: arguments of its command line.
         runs: folder of all results; written as ``paths.runs``.
     """
@@ -75,4 +75,5 @@ def shown(command: str, arguments: Sequence[str], runs: str) -> str:
     """Return a command line that repeats the command, without the overrides in ``LOCAL`` and with ``paths.runs`` in place of the folder ``runs``."""
     folder = re.compile(rf"(?<![^=,\[\"' ]){re.escape(runs)}(?![^/,\]\"' ])")  # as a whole path or the beginning of one
     kept = [folder.sub("paths.runs", argument) for argument in arguments if not argument.lstrip("+").startswith(LOCAL)]
-    return shlex.join(["python", "-m", f"gpe_pl.{command}", *kept])
+    program = [command] if command.endswith(".py") else ["-m", f"gpe_pl.{command}"]
+    return shlex.join(["python", *program, *kept])

@@ -29,6 +29,7 @@ def test_a_folder_without_results_stays_as_it_is(tmp_path: Path) -> None:
 def test_a_command_is_shown_without_the_folders_of_one_machine() -> None:
     arguments = ["-m", "name=a b", "paths.runs=/home/me/runs", "+paths.data=/data", "checkpoint=/home/me/runs/sand", "hydra.sweep.dir=/x"]
     assert shown("fit", arguments, "/home/me/runs") == "python -m gpe_pl.fit -m 'name=a b' checkpoint=paths.runs/sand"
+    assert shown("docs/active_curve.py", ["FOLDER"], "/home/me/runs") == "python docs/active_curve.py FOLDER"
 
 
 def test_only_paths_are_replaced_where_the_folder_has_a_common_name() -> None:
