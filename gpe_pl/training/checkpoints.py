@@ -1,16 +1,17 @@
-"""Checkpoints of a run: decides when to save, keeps the best score, and writes each file whole or not at all."""
+"""Checkpoints of a run: decides when to save and which validation counts as best, and writes each file whole or not at all."""
 
 from __future__ import annotations
 
 import io
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
 from lightning.fabric.plugins.io import TorchCheckpointIO
 from lightning.pytorch.callbacks import Checkpoint
@@ -19,35 +20,54 @@ from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.learned.checkpoint_file import CheckpointError, load_checkpoint, reason
 from gpe_pl.system import ranks
+from gpe_pl.training.callbacks import RolloutValidation
 from gpe_pl.training.interruption import Interruption
 
-SCORE = "val/rollout_mse"
-"""Metric of a validation; the model with its lowest value becomes the best checkpoint."""
+NUM_STANDARD_ERRORS = 2.0
+"""How far above the lowest mean error a validation has to be, in standard errors, to be clearly worse."""
+
+
+def clearly_worse(errors: Sequence[float], lowest: Sequence[float]) -> bool:
+    """Whether a validation shows that a model is worse than another one on the same trajectories.
+
+    The mean of the paired differences must be more than ``NUM_STANDARD_ERRORS`` of its standard errors above 0. One trajectory has no standard error, so a
+    higher error is enough there. Few rollouts cannot tell apart models of nearly equal errors, and the later one was trained for longer.
+
+    Args:
+        errors: errors of the model [trajectory].
+        lowest: errors of the other model [trajectory].
+    """
+    if not np.isfinite(errors).all() or len(errors) != len(lowest):
+        return True
+    difference = np.subtract(errors, lowest)
+    spread = float(difference.std(ddof=1)) / math.sqrt(len(difference)) if len(difference) > 1 else 0.0
+    return float(difference.mean()) > NUM_STANDARD_ERRORS * spread
 
 
 class Checkpoints(Checkpoint):
-    """Saves ``last.ckpt`` regularly, and ``best.ckpt`` after each validation with the best score so far.
+    """Saves ``last.ckpt`` regularly, and ``best.ckpt`` after each validation that is not ``clearly_worse`` than the one with the lowest mean error so far.
 
-    ``last.ckpt`` is saved after every validation, every ``seconds`` between validations, and when training is interrupted. A checkpoint stores the best score
-    and its step but no path, so a run's folder can be moved. All ranks save and stop together.
+    ``last.ckpt`` is saved after every validation, every ``seconds`` between validations, and when training is interrupted. A checkpoint stores the errors that
+    the next validation is compared with but no path, so a run's folder can be moved. All ranks save and stop together.
 
     Args:
         folder: folder of the two files.
         seconds: time from one ``last.ckpt`` to the next between validations [s].
         interruption: notes signals from the first step on. After one, ``last.ckpt`` is saved and training ends with ``KeyboardInterrupt``.
+        validation: has the errors of the last validation.
 
     Attributes:
-        best_score: validation score of ``best.ckpt`` [m²]; None if there is none.
         best_step: training step of ``best.ckpt``; None if there is none.
+        lowest: errors [m², trajectory] of the validation with the lowest mean; None before the first one.
         saved_step: training step of ``last.ckpt``; None if this process has neither loaded nor saved it.
         has_begun: whether a training step has begun. By then, all of ``last.ckpt`` has been restored.
     """
 
-    def __init__(self, folder: Path, seconds: float = math.inf, interruption: Interruption | None = None) -> None:
+    def __init__(self, folder: Path, seconds: float, interruption: Interruption, validation: RolloutValidation) -> None:
         self.best, self.last = folder / "best.ckpt", folder / "last.ckpt"
-        self.seconds, self.interruption = seconds, interruption or Interruption()
-        self.best_score: float | None = None
+        self.seconds, self.interruption, self.validation = seconds, interruption, validation
         self.best_step: int | None = None
+        self.lowest: list[float] | None = None
         self.saved_step: int | None = None
         self.has_begun = False
         self._saved_at = time.monotonic()
@@ -77,9 +97,11 @@ class Checkpoints(Checkpoint):
             raise KeyboardInterrupt
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        score = float(trainer.callback_metrics[SCORE])
-        if self.best_score is None or score < self.best_score:
-            self.best_score, self.best_step = score if math.isfinite(score) else math.inf, trainer.global_step
+        errors = self.validation.errors
+        is_better = self.lowest is None or float(np.mean(errors)) < float(np.mean(self.lowest))
+        if self.lowest is None or not clearly_worse(errors, self.lowest):
+            self.best_step = trainer.global_step
+            self.lowest = errors if is_better else self.lowest
             trainer.save_checkpoint(self.best, weights_only=False)
         self._save_last(trainer)
         if self._agreed(pl_module, self.interruption.requested)[0]:
@@ -111,19 +133,21 @@ class Checkpoints(Checkpoint):
     # --- what is remembered ---------------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        return {"best_score": self.best_score, "best_step": self.best_step}
+        return {"best_step": self.best_step, "lowest": self.lowest}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the best score and its step from the result of ``state_dict``, unless ``best.ckpt`` is missing.
+        """Restore the step of the best checkpoint and the lowest errors from the result of ``state_dict``, unless ``best.ckpt`` is missing.
 
         Raises:
             CheckpointError: ``state_dict`` holds something else.
         """
-        score, step = (state_dict.get(key) for key in ("best_score", "best_step"))
-        if (score, step) != (None, None) and not (type(score) is float and type(step) is int):
-            raise CheckpointError(f"{self.last}: does not hold the score and step of the best checkpoint; delete the file")
-        if self.best.exists():  # else the next validation is the best so far
-            self.best_score, self.best_step = score, step
+        step, lowest = (state_dict.get(key) for key in ("best_step", "lowest"))
+        if lowest is None:
+            return  # saved before the first validation, or by an earlier version: the next validation is the best so far
+        if not (type(step) is int and type(lowest) is list and lowest and all(type(error) is float for error in lowest)):
+            raise CheckpointError(f"{self.last}: does not hold step and errors of the best checkpoint; delete the file")
+        if self.best.exists():
+            self.best_step, self.lowest = step, lowest
 
     def on_load_checkpoint(self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
         self.saved_step = checkpoint["global_step"]

@@ -217,7 +217,7 @@ def train(
         callbacks: callbacks of Lightning beyond those of every run.
 
     Returns:
-        Path of the checkpoint with the best validation rollout.
+        Path of the best checkpoint; see ``Checkpoints``.
 
     Raises:
         RunError: the accelerator or devices are not available, or training was interrupted; the message says how to resume.
@@ -226,12 +226,13 @@ def train(
     """
     datamodule.push_forward = training.push_forward  # known only now, as it depends on the number of steps within a time budget
     interruption = Interruption()
-    checkpoints = Checkpoints(run_dir / "checkpoints", 60 * trainer_settings.checkpoint_minutes, interruption)
     shortest = min(t.num_frames for t in datamodule.val_trajectories(1))
     steps = min(training.val_rollout_steps, shortest - datamodule.builder.config.history - 1)
     averages = [] if training.ema_decay is None else [WarmAverage(training.ema_decay)]
+    validation = RolloutValidation(datamodule.val_trajectories(training.num_val_rollouts), steps, training.val_containment)
+    checkpoints = Checkpoints(run_dir / "checkpoints", 60 * trainer_settings.checkpoint_minutes, interruption, validation)
     own: list[Callback] = [
-        RolloutValidation(datamodule.val_trajectories(training.num_val_rollouts), steps, training.val_containment),
+        validation,
         *averages,
         LearningRateMonitor(),
         checkpoints,

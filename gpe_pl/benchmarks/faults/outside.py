@@ -65,7 +65,7 @@ STATES: dict[str, Callable[[str], dict[str, Any]]] = {
         "kth_value": torch.tensor(1e9),
         "best_k_models": {path: torch.tensor(1e9)},
     },
-    "own": lambda path: {"best": path, "last": path, "best_score": 1e9, "best_step": 0},
+    "own": lambda path: {"best": path, "last": path, "best_step": 0, "lowest": [1e9]},
 }
 """States of callbacks in a checkpoint that name a path."""
 

@@ -29,7 +29,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.training.callbacks import RolloutValidation
-from gpe_pl.training.checkpoints import Checkpoints
+from gpe_pl.training.checkpoints import Checkpoints, clearly_worse
 from gpe_pl.training.interruption import Interruption
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
@@ -58,11 +58,11 @@ def data(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> Path:
 
 
 @pytest.fixture
-def scores(monkeypatch: pytest.MonkeyPatch) -> dict[int, float]:
+def errors(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[float]]:
     """Set the result of the validation after each step; later ones are worse."""
-    found = {3: 1.0, 6: 2.0, 9: 3.0}
+    found = {3: [1.0], 6: [2.0], 9: [3.0]}
     steps: list[int] = []
-    monkeypatch.setattr(RolloutValidation, "_mse", lambda *_: found[steps[-1]])
+    monkeypatch.setattr(RolloutValidation, "_errors", lambda *_: found[steps[-1]])
     plain = RolloutValidation.on_validation_epoch_end
 
     def on_validation_epoch_end(self: RolloutValidation, trainer: Any, module: Any) -> None:
@@ -135,7 +135,7 @@ def assert_like(run: Path, whole: Path) -> None:
     assert stored(run)["callbacks"]["Checkpoints"] == stored(whole)["callbacks"]["Checkpoints"]
 
 
-def test_a_run_that_was_moved_knows_its_best_checkpoint(data: Path, tmp_path: Path, scores: dict[int, float]) -> None:
+def test_a_run_that_was_moved_knows_its_best_checkpoint(data: Path, tmp_path: Path, errors: dict[int, list[float]]) -> None:
     trained(data, tmp_path / "whole")
     assert stored(tmp_path / "whole", "best")["global_step"] == 3
     with pytest.raises(Killed):
@@ -144,11 +144,46 @@ def test_a_run_that_was_moved_knows_its_best_checkpoint(data: Path, tmp_path: Pa
     assert trained(data, tmp_path / "there" / "run") == tmp_path / "there" / "run" / "checkpoints" / "best.ckpt"
     assert stored(tmp_path / "there" / "run", "best")["global_step"] == 3
     assert_like(tmp_path / "there" / "run", tmp_path / "whole")
-    assert stored(tmp_path / "there" / "run")["callbacks"]["Checkpoints"] == {"best_score": 1.0, "best_step": 3}
+    assert stored(tmp_path / "there" / "run")["callbacks"]["Checkpoints"] == {"best_step": 3, "lowest": [1.0]}
     assert not (tmp_path / "here").exists()
 
 
-def test_without_the_best_checkpoint_the_next_validation_makes_one(data: Path, tmp_path: Path, scores: dict[int, float]) -> None:
+def test_the_latest_that_is_not_clearly_worse_is_the_best(data: Path, tmp_path: Path, errors: dict[int, list[float]]) -> None:
+    errors |= {3: [1.0, 1.0, 1.0], 6: [0.8, 0.9, 1.6], 9: [1.9, 2.0, 2.2]}
+    trained(data, tmp_path / "run")
+    assert stored(tmp_path / "run", "best")["global_step"] == 6  # 10 % worse, by one scene of three
+    assert stored(tmp_path / "run")["callbacks"]["Checkpoints"] == {"best_step": 6, "lowest": [1.0, 1.0, 1.0]}
+
+
+@pytest.mark.parametrize(
+    ("later", "expected"),
+    [
+        ([1.1, 2.1, 3.1], True),  # the same difference in every scene
+        ([0.9, 1.9, 2.9], False),
+        ([1.0, 2.0, 3.0], False),
+        ([2.0, 1.8, 2.9], False),  # worse on average, by one scene
+        ([math.nan, 1.0, 1.0], True),
+        ([0.5], True),  # of other scenes
+    ],
+)
+def test_clearly_worse(later: list[float], expected: bool) -> None:
+    assert clearly_worse(later, [1.0, 2.0, 3.0]) is expected
+
+
+def test_one_scene_has_no_standard_error() -> None:
+    assert clearly_worse([1.01], [1.0])
+    assert not clearly_worse([1.0], [1.0])
+
+
+def test_slow_drift_is_compared_with_the_lowest(data: Path, tmp_path: Path, errors: dict[int, list[float]]) -> None:
+    errors |= {3: [1.0, 1.0], 6: [1.0, 1.4], 9: [1.3, 1.45]}  # the last is not clearly worse than the second, but than the first
+    assert not clearly_worse(errors[9], errors[6])
+    assert clearly_worse(errors[9], errors[3])
+    trained(data, tmp_path / "run")
+    assert stored(tmp_path / "run", "best")["global_step"] == 6
+
+
+def test_without_the_best_checkpoint_the_next_validation_makes_one(data: Path, tmp_path: Path, errors: dict[int, list[float]]) -> None:
     with pytest.raises(Killed):
         trained(data, tmp_path / "run", at={7: stop(Killed)})
     (tmp_path / "run" / "checkpoints" / "best.ckpt").unlink()
@@ -253,7 +288,7 @@ PATHS = ["local://{victim}", *(pytest.param(path, marks=pytest.mark.slow) for pa
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_no_path_in_a_checkpoint_is_followed(data: Path, tmp_path: Path, scores: dict[int, float], path: str) -> None:
+def test_no_path_in_a_checkpoint_is_followed(data: Path, tmp_path: Path, errors: dict[int, list[float]], path: str) -> None:
     """All keys under which Lightning's own callback keeps paths."""
     run, victim = tmp_path / "run", tmp_path / "victim"
     with pytest.raises(Killed):
@@ -316,10 +351,20 @@ def test_checkpoints_that_are_links_are_replaced_not_followed(data: Path, tmp_pa
     assert not (folder / "best.ckpt").is_symlink()
 
 
-@pytest.mark.parametrize("state", [{"best_score": "low", "best_step": 3}, {"best_score": 1.0}, {"best_score": 1.0, "best_step": 3.0}])
-def test_what_is_no_score_is_refused(tmp_path: Path, state: dict[str, Any]) -> None:
-    with pytest.raises(CheckpointError, match="last.ckpt: does not hold the score and step of the best checkpoint"):
-        Checkpoints(tmp_path).load_state_dict(state)
+STATES: list[dict[str, Any]] = [{"lowest": "low", "best_step": 3}, {"lowest": [1.0]}, {"lowest": [1], "best_step": 3}, {"lowest": [1.0], "best_step": 3.0}]
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_what_are_no_errors_is_refused(tmp_path: Path, state: dict[str, Any]) -> None:
+    with pytest.raises(CheckpointError, match="last.ckpt: does not hold step and errors of the best checkpoint"):
+        Checkpoints(tmp_path, math.inf, Interruption(), RolloutValidation([], 1)).load_state_dict(state)
+
+
+def test_an_earlier_version_said_nothing_of_errors(tmp_path: Path) -> None:
+    (tmp_path / "best.ckpt").touch()
+    checkpoints = Checkpoints(tmp_path, math.inf, Interruption(), RolloutValidation([], 1))
+    checkpoints.load_state_dict({"best_score": 1.0, "best_step": 3})
+    assert checkpoints.lowest is checkpoints.best_step is None
 
 
 CONTENTS: dict[str, Any] = {
