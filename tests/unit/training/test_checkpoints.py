@@ -351,7 +351,12 @@ def test_checkpoints_that_are_links_are_replaced_not_followed(data: Path, tmp_pa
     assert not (folder / "best.ckpt").is_symlink()
 
 
-STATES: list[dict[str, Any]] = [{"lowest": "low", "best_step": 3}, {"lowest": [1.0]}, {"lowest": [1], "best_step": 3}, {"lowest": [1.0], "best_step": 3.0}]
+STATES: list[dict[str, Any]] = [
+    {"lowest": "low", "best_step": 3},
+    {"lowest": [1.0]},
+    {"lowest": [1], "best_step": 3},
+    {"lowest": [1.0], "best_step": 3.0},
+]
 
 
 @pytest.mark.parametrize("state", STATES)
