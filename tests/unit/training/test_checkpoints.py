@@ -369,7 +369,7 @@ def test_an_earlier_version_said_nothing_of_errors(tmp_path: Path) -> None:
     (tmp_path / "best.ckpt").touch()
     checkpoints = Checkpoints(tmp_path, math.inf, Interruption(), RolloutValidation([], 1))
     checkpoints.load_state_dict({"best_score": 1.0, "best_step": 3})
-    assert checkpoints.lowest is checkpoints.best_step is None
+    assert (checkpoints.lowest, checkpoints.best_step) == (None, None)
 
 
 CONTENTS: dict[str, Any] = {
