@@ -351,6 +351,7 @@ class FeatureSpec:
         islands: whether graphs contain the island of each node, and tell which islands do not touch the boundary.
         cells: whether graphs contain the cells of meshes and their rest shape.
         loads: loads of nodes that are features of the nodes of materials, names of ``LOADS``.
+        reads_stress: whether the stress of the present frame is a feature of the nodes of materials that have one.
     """
 
     dim: int
@@ -365,6 +366,7 @@ class FeatureSpec:
     islands: bool = False
     cells: bool = False
     loads: tuple[str, ...] = ()
+    reads_stress: bool = False
 
     @property
     def param_channels(self) -> dict[str, int]:

@@ -29,7 +29,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.rollout.loop import Restartable
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.openings import carried
-from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.store import StoreError, UnsoundError, open_field, open_group, open_shard, read_trajectory, shards, trajectory_names
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -475,6 +475,7 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             frame_velocity=at_frame,
             rigid_body=trajectory.rigid_body,
             loads=trajectory.loads_at(history),
+            stress=_stress_at(trajectory, history) if self.builder.spec.reads_stress else None,
         )
         rows, alive = np.arange(state.num_nodes), None
         if self.is_open:
@@ -517,6 +518,11 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         left = kept ** np.arange(1, self.unroll_steps + 1)[:, None, None]
         reference = truth[history + 1 :] + left * (pos[history] - truth[history])
         return Unroll(graph, state, torch.from_numpy(reference), stress, about)
+
+
+def _stress_at(trajectory: Trajectory, frame: int) -> Stress | None:
+    """Return the true stress at a frame of a window; None if the trajectory has none."""
+    return None if trajectory.stress is None else Stress(np.array(trajectory.stress.node[frame]), np.array(trajectory.stress.cell[frame]))
 
 
 def _living(state: State, window: Trajectory, frame: int) -> tuple[State, np.ndarray]:

@@ -65,6 +65,8 @@ def check(simulator: LearnedSimulator) -> None:
         wrong = "a model of several spacings and frame intervals"
     elif builder.spec.loads:
         wrong = "a model of scenes with prescribed nodes or forces"
+    elif builder.spec.reads_stress:
+        wrong = "a model that reads the stress"
     elif len(builder.spec.materials) > 1:
         wrong = f"a model of several materials ({', '.join(builder.spec.materials)})"
     elif different := [f"model.{key}={model.settings[key]}" for key, value in wanted.items() if model.settings[key] != value]:

@@ -280,7 +280,7 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
 
 
 class NodeLoadError(GpeError, ValueError):
-    """Raised for a simulator of scenes with prescribed nodes or forces, which an exported program does not take."""
+    """Raised for a simulator that reads prescribed nodes, forces or stresses, which an exported program does not take."""
 
 
 class MirrorAverageError(GpeError, ValueError):
@@ -294,7 +294,7 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
         ValueError: ``path`` has another file type.
         CellError: the model needs the cells of meshes, which a program does not take.
         MirrorAverageError: the simulator averages over mirror images, which a program does not.
-        NodeLoadError: the data set of the simulator has prescribed nodes or forces, which a program does not take.
+        NodeLoadError: the data set of the simulator has prescribed nodes or forces, or the model reads the stress, which a program does not take.
     """
     path = Path(path)
     if simulator.mirror_average:
@@ -305,6 +305,8 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
         raise CellError("exported programs have no cells; export a model with model.elastic=false graph.cells=false")
     if simulator.builder.spec.loads:
         raise NodeLoadError("exported programs take neither prescribed nodes nor forces; export a model of data without them")
+    if simulator.builder.spec.reads_stress:
+        raise NodeLoadError("exported programs do not read a stress; export a model with graph.stress=false")
     if path.suffix != ".pt2":
         raise ValueError(f"{path}: an exported program ends in .pt2")
     step = ExportedStep(copy.deepcopy(simulator).cpu().eval())

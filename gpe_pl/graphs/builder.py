@@ -40,6 +40,7 @@ from gpe_pl.graphs.load_features import add_loads
 from gpe_pl.graphs.neighbors import Points, are_below, check_crowding
 from gpe_pl.graphs.search import as_array, find_topology, rows_of
 from gpe_pl.graphs.standards import Standards, raw
+from gpe_pl.graphs.stress_features import add_stress
 from gpe_pl.graphs.topology import GraphError as GraphError
 from gpe_pl.graphs.topology import IslandTopology, MeshTopology, Topology
 from gpe_pl.rollout.loop import SimulationError
@@ -132,7 +133,7 @@ class GraphBuilder:
 
         Raises:
             GraphError: the state has a node type that the data set does not have, has another number of past velocities, has other periodic axes, has cells
-                that do not fit its nodes, or is not float64.
+                that do not fit its nodes, lacks a stress that the graph reads, or is not float64.
             MeshError: a cell has a node that does not exist, or a rest position is not finite.
             SimulationError: a position or velocity is not finite or beyond ``LARGEST``, or so many nodes lie within each other's radius that the material has
                 collapsed.
@@ -163,6 +164,10 @@ class GraphBuilder:
             raise GraphError(
                 f"state is periodic along {other}, the data set {self.metadata.dataset!r} along {own}; make the state with the same periodic axes"
             )
+        if self.spec.reads_stress and state.stress is None:
+            raise GraphError(
+                "graph.stress=true: the state has no stress; give that of the first frame, zeros for a body at rest and undeformed"
+            )
         history = history_of(state)
         if history.shape[1] != self.config.history:
             raise GraphError(
@@ -191,7 +196,7 @@ class GraphBuilder:
         """
         if standards is not None or (compiled_graph.works_on(state) and (topology.mesh is None or topology.mesh.edges is not None)):
             data = self._compiled(standards or self._raw)(topology, state)
-            return self._with_loads(self._with_cells(data, topology, state), topology, state, standards)
+            return self._with_stress_and_loads(self._with_cells(data, topology, state), topology, state, standards)
         data, history, boundary = HeteroData(), history_of(state), state.boundary
         for material, r in topology.rows.items():
             store = data[material]
@@ -227,9 +232,11 @@ class GraphBuilder:
                 data[material].body = body
             if self.spec.meshes:
                 data.num_bodies = torch.full((1,), islands.num_bodies, device=arm.device)
-        return self._with_loads(self._with_cells(data, topology, state), topology, state)
+        return self._with_stress_and_loads(self._with_cells(data, topology, state), topology, state)
 
-    def _with_loads(self, data: HeteroData, topology: Topology, state: State, standards: Standards | None = None) -> HeteroData:
+    def _with_stress_and_loads(self, data: HeteroData, topology: Topology, state: State, standards: Standards | None = None) -> HeteroData:
+        if self.spec.reads_stress:
+            add_stress(data, topology, state, self.spec, standards, self.precision)
         if self.spec.loads:
             add_loads(data, topology, state, self.spec, self.scales, standards, self.precision)
         return data

@@ -67,6 +67,7 @@ class GraphConfig:
         cells: include the cells of meshes and their rest shape, for ``model.elastic``; needs ``mesh`` and ``islands``.
         scales: ``one`` if all data have one spacing and one frame interval. With ``dimensionless``, they may vary, and models get both as features (see
             ``Scales``). With ``dimensional``, they may vary, too, and models are not told.
+        stress: nodes have the Cauchy stress of the present frame as features (see ``stress_features``); for models that predict it.
     """
 
     features: Features = "contact"
@@ -80,6 +81,7 @@ class GraphConfig:
     islands: bool = False
     cells: bool = False
     scales: ScaleUse = "one"
+    stress: bool = False
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     """Return the channel counts of a data set's graphs.
 
     Raises:
-        GraphError: ``config.cells`` without ``mesh`` or ``islands``, or several scales with meshes or loads.
+        GraphError: ``config.cells`` without ``mesh`` or ``islands``, several scales with meshes or loads, or ``config.stress`` without a stored stress.
     """
     if config.cells and not (config.mesh and config.islands):
         raise GraphError("graph.cells=true needs graph.mesh=true graph.islands=true; choose these, or law=none")
@@ -168,6 +170,13 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     meshes = set(materials) & set(MESH_MATERIALS) if config.mesh else set()
     if config.scales != "one" and (meshes or metadata.loads):
         raise GraphError(f"graph.scales={config.scales}: works with particles only; set graph.mesh=false, or graph.scales=one")
+    stress_channels = dict.fromkeys(metadata.with_stress, 4 if dim == 2 else 6)
+    if config.stress and (not stress_channels or config.scales != "one"):
+        raise GraphError(
+            f"graph.stress=true: the data set stores no stress of {', '.join(materials)}; set graph.stress=false"
+            if not stress_channels
+            else f"graph.scales={config.scales}: not with graph.stress=true; set one of them to its default"
+        )
     if not meshes:
         num_levels = 0
     elif config.num_levels is not None:
@@ -185,7 +194,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
         dim=dim,
         materials=materials,
         node_channels={
-            **dict.fromkeys(materials, motion + of_loads + SCALE_CHANNELS * is_told),
+            **{m: motion + of_loads + SCALE_CHANNELS * is_told + config.stress * stress_channels.get(m, 0) for m in materials},
             BOUNDARY: 2 * dim + 2 if config.boundary_condition else dim,
             **virtual,
         },
@@ -193,11 +202,12 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
         relations=relations,
         odd_channels={r: odd for r, (odd, _) in channels.items()},
         even_channels={r: even for r, (_, even) in channels.items()},
-        stress_channels=dict.fromkeys(metadata.with_stress, 4 if dim == 2 else 6),
+        stress_channels=stress_channels,
         num_levels=num_levels,
         islands=config.islands,
         cells=config.cells,
         loads=loads,
+        reads_stress=config.stress,
     )
 
 

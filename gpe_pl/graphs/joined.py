@@ -29,8 +29,13 @@ UNUSED = ("cells", "rest_pos", "frame_velocity", "loads", "rigid_body", "node_id
 
 
 def covers(topologies: Sequence[Topology], states: Sequence[State], spec: FeatureSpec) -> bool:
-    """Tell whether ``joined_graph`` can make the batch of these scenes: they have no meshes and no loads, and one periodicity."""
-    if spec.cells or spec.loads or any(t.mesh is not None or t.periodicity != topologies[0].periodicity for t in topologies):
+    """Tell whether ``joined_graph`` can make the batch of these scenes: they have no meshes and no loads, read no stress, and have one periodicity."""
+    if (
+        spec.cells
+        or spec.loads
+        or spec.reads_stress
+        or any(t.mesh is not None or t.periodicity != topologies[0].periodicity for t in topologies)
+    ):
         return False
     return all(map(works_on, states))
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from gpe_pl.graphs.islands import islands_within
 from gpe_pl.graphs.neighbors import radius_between
 from gpe_pl.graphs.search import walls_of
+from gpe_pl.graphs.topology import GraphError
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import SimulationError, Simulator, sound, step_all
 from gpe_pl.trajectory import integrators
@@ -71,9 +72,16 @@ class Sleeping(Batched):
 
     Args:
         simulator: simulator, whose ``skips`` set when islands sleep.
+
+    Raises:
+        GraphError: the model reads the stress.
     """
 
     def __init__(self, simulator: LearnedSimulator) -> None:
+        if simulator.builder.spec.reads_stress:
+            raise GraphError(
+                "rollout.sleep_after: models with graph.stress=true need the stress of all nodes; set rollout.sleep_after=null"
+            )
         self.simulator = simulator
         self.radius, self.dt = simulator.builder.scales.radius, simulator.builder.metadata.frame_dt
 

@@ -28,7 +28,7 @@ from gpe_pl.graphs.compiled_graph import works_on
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
 from gpe_pl.graphs.standards import Standards
-from gpe_pl.graphs.topology import Topology
+from gpe_pl.graphs.topology import GraphError, Topology
 from gpe_pl.learned import next_states, training_ranges, transfer
 from gpe_pl.learned.checkpoint_file import CheckpointError as CheckpointError
 from gpe_pl.learned.checkpoint_file import load_checkpoint, reason
@@ -90,6 +90,8 @@ class LearnedSimulator(nn.Module):
 
     def __init__(self, model: Model, builder: GraphBuilder, stride: int = 1) -> None:
         super().__init__()
+        if builder.spec.reads_stress and not model.settings.get("stress", False):
+            raise GraphError("graph.stress=true: the model predicts no stress, which its next step reads; set model.stress=true")
         self.model, self.builder, self.stride = model, builder, stride
         self._static_friction, self._averaged = 0.0, MirrorAverage(builder.metadata.bounds)
         self._warned: set[str] = set()
@@ -119,6 +121,8 @@ class LearnedSimulator(nn.Module):
 
     @skips.setter
     def skips(self, skips: Skips) -> None:
+        if self.builder.spec.reads_stress:  # the next step needs it
+            skips = replace(skips, stress=False)
         self.builder = replace(self.builder, skips=skips)
         self.model.skips = skips
 
@@ -431,10 +435,7 @@ class LearnedSimulator(nn.Module):
         elif self.static_friction:  # walls are at rest
             for state, after, topology in zip(states, new, topologies, strict=True):
                 next_states.keep_slow(state, after, topology, self.static_friction * builder.metadata.frame_dt)
-        if not predicted.stress:
-            return new
-        components = next(iter(builder.spec.stress_channels.values()))
-        return next_states.with_stress(new, rows, predicted.stress, self.stress_std, components)
+        return new
 
     def moved(self, states: list[State], graphs: list[HeteroData], predicted: Prediction) -> list[State]:
         """Return the states one frame later, given the states, their graphs, and the model's prediction for their batch."""
@@ -442,14 +443,18 @@ class LearnedSimulator(nn.Module):
         return [self._with_static_friction(*parts) for parts in zip(states, new, graphs, strict=True)] if self.static_friction else new
 
     def later(self, states: list[State], rows: Sequence[Rows], predicted: Prediction) -> list[State]:
-        """Do the same as ``moved`` without static friction, given the rows of the nodes of each material in each state."""
+        """Do the same as ``moved`` without static friction, given the rows of each material's nodes. Training states get a stress only if graphs read it."""
         acceleration, dt = predicted.acceleration, self.builder.metadata.frame_dt
         if next_states.works_on_all(states, acceleration):
             new = next_states.moved(states, rows, acceleration, float(self.acceleration_std), dt)
         else:
             all_acc = next_states.accelerations(states, rows, acceleration, self.acceleration_std)
             new = [self.advance(state, acc) for state, acc in zip(states, all_acc, strict=True)]
-        return next_states.with_frame_velocity(new, rows, predicted.frame_velocity, dt)
+        new = next_states.with_frame_velocity(new, rows, predicted.frame_velocity, dt)
+        if not predicted.stress or (self.training and not self.builder.spec.reads_stress):
+            return new
+        components = next(iter(self.builder.spec.stress_channels.values()))
+        return next_states.with_stress(new, rows, predicted.stress, self.stress_std, components)
 
     def integrated(self, state: State, graph: HeteroData, acc: Tensor) -> State:
         """Return the next state under an acceleration [node, dim] in m/s² that includes gravity. Static friction keeps slow nodes in place."""

@@ -24,7 +24,7 @@ from gpe_pl.models.base import Prediction
 from gpe_pl.rollout.flow import through_openings
 from gpe_pl.rollout.loop import SimulationError, step_scenes
 from gpe_pl.system import ranks
-from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.state import State, Stress
 
 MOVED = ("pos", "vel", "velocity_history", "frame_velocity", "time")
 """Fields of a state that a step changes. A moving boundary changes, too, but follows from the number of steps."""
@@ -75,7 +75,8 @@ class Excursions:
         for lane, way in self._lanes.items():
             scenes = zip(way.samples, way.states, way.steps, strict=True)
             own[lane] = {
-                sample: {"steps": steps, **{name: getattr(state, name) for name in _moving(state)}} for sample, state, steps in scenes
+                sample: {"steps": steps, **{name: getattr(state, name) for name in _moving(state)}, **_stored_stress(state)}
+                for sample, state, steps in scenes
             }
         together: Stored = {}
         for part in ranks.gathered(own):
@@ -171,7 +172,19 @@ def _moved(start: State, scene: dict[str, Any]) -> State:
                 )
             there = there.to(here.device)
         values[name] = there
+    if start.stress is not None:
+        node = scene.get("node_stress")
+        if not (isinstance(node, Tensor) and node.shape == start.stress.node.shape):
+            raise CheckpointError(
+                "last.ckpt: excursions.node_stress does not fit the training data; delete the file to train from the start"
+            )
+        values["stress"] = Stress(node.to(start.stress.node), scene["cell_stress"].to(start.stress.cell))
     return replace(start, **values)
+
+
+def _stored_stress(state: State) -> dict[str, Tensor]:
+    """Return the stress that the next step of a model reads; nothing for other models."""
+    return {} if state.stress is None else {"node_stress": state.stress.node, "cell_stress": state.stress.cell}
 
 
 def _located(simulator: LearnedSimulator, scale: tuple[float, float] | None) -> LearnedSimulator:
