@@ -151,8 +151,8 @@ def report(folder: Path) -> None:
     panels[0].legend(fontsize=6, frameon=False)
     lines += [table_row(row) for row in rows]
     note = (
-        f"Means over {len(seeds)} seeds and test scenes, with 95 % bootstrap intervals over both. MSE: mean squared displacement over the frames up to the "
-        f"horizon. Before a choice, each seed has {MEMBERS} models, afterwards one."
+        f"Means over test scenes and seeds (number: {len(seeds)}), with 95 % bootstrap intervals over both. MSE: mean squared displacement over the frames up "
+        f"to the horizon. Before a choice, each seed has {MEMBERS} models, afterwards one."
     )
     replace_text(folder / "table.md", "\n".join([*lines, "", note, "", *choices_table(folder), ""]))
     save_figure(figure, folder / "active.png", dpi=150)
