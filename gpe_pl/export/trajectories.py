@@ -41,7 +41,7 @@ VTK_TYPES = {"float32": "Float32", "float64": "Float64", "int32": "Int32", "int6
 def write_npz(path: Path | str, trajectory: Trajectory) -> None:
     """Write a trajectory as arrays that ``numpy.load`` reads, in the precision of the store. The file is written atomically.
 
-    Names, shapes and units are those of ``schema.FIELDS``; ``metadata``, ``shapes`` and ``node_types`` are JSON.
+    Names, shapes and units are those of ``schema.FIELDS``; ``metadata``, ``shapes`` and ``node_types`` are JSON. ``convert format=arrays`` imports such files.
 
     Raises:
         ValueError: ``path`` does not end in ``.npz``.

@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -139,7 +139,7 @@ def digested_attributes(group: h5py.Group) -> dict[str, str]:
     return {key: read_text(group, key) for key in (*ATTRIBUTES, *(key for key in FURTHER if key in group.attrs))}
 
 
-def digest(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
+def digest(arrays: Mapping[str, np.ndarray], attributes: Mapping[str, str]) -> str:
     """Return the SHA-256 digest of names, shapes, types and bytes of all arrays and attributes of a trajectory."""
     sha = hashlib.sha256()
     for name, text in sorted(attributes.items()):
@@ -194,12 +194,16 @@ def write_shard(path: Path | str, trajectories: Iterable[Trajectory], names: Ite
 
 
 def _write_trajectory(group: h5py.Group, trajectory: Trajectory) -> None:
-    arrays, attributes = stored_arrays(trajectory), stored_attributes(trajectory)
+    fill_group(group, stored_arrays(trajectory), stored_attributes(trajectory))
+    if trajectory.is_prediction:
+        _write_text(group, PREDICTION, "")
+
+
+def fill_group(group: h5py.Group, arrays: Mapping[str, np.ndarray], attributes: Mapping[str, str]) -> None:
+    """Write what ``stored_arrays`` and ``stored_attributes`` return into the empty group of a trajectory, with their digest."""
     for key, text in attributes.items():
         _write_text(group, key, text)
     _write_text(group, "sha256", digest(arrays, attributes))
-    if trajectory.is_prediction:
-        _write_text(group, PREDICTION, "")
     for key, array in arrays.items():
         empty = array.size == 0
         options = {} if empty else {"chunks": _chunks(array, FIELDS[key].dims), "fletcher32": True, **COMPRESSION}
@@ -398,26 +402,30 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
     if verify and frames is not None:
         raise ValueError("the digest covers all frames: pass verify or frames, not both")
     with open_shard(path) as file:
-        group = open_group(file, name)
-        metadata = metadata_of(group)
-        arrays = {key: read_field(group, key, frames) for key, spec in FIELDS.items() if spec.required or is_named(group, key)}
-        first_frame = 0 if frames is None else frames.indices(open_field(group, "pos").shape[0])[0]
-        if verify and digest(arrays, digested_attributes(group)) != read_text(group, "sha256"):
-            raise StoreError(f"{path}:{name}: SHA-256 digest does not match the content; {ADVICE}")
-        if ("node_stress" in arrays) != ("cell_stress" in arrays):
-            raise StoreError(f"{path}:{name}: has only one of the fields 'node_stress' and 'cell_stress'; {ADVICE}")
-        for conflict in size_conflicts(arrays, metadata.dim, len(metadata.param_names)):
-            raise StoreError(f"{path}:{name}: {conflict}; {ADVICE}")
-        shapes, names, is_prediction, begins = shapes_of(group), node_types_of(group), PREDICTION in group.attrs, start_time_of(group)
-        openings = openings_of(group)
+        return trajectory_in(open_group(file, name), verify, frames)
+
+
+def trajectory_in(group: h5py.Group, verify: bool = False, frames: slice | None = None) -> Trajectory:
+    """Return the trajectory of an open group; arguments and errors are those of ``read_trajectory``."""
+    metadata, where = metadata_of(group), _where(group)
+    arrays = {key: read_field(group, key, frames) for key, spec in FIELDS.items() if spec.required or is_named(group, key)}
+    first_frame = 0 if frames is None else frames.indices(open_field(group, "pos").shape[0])[0]
+    if verify and digest(arrays, digested_attributes(group)) != read_text(group, "sha256"):
+        raise StoreError(f"{where}: SHA-256 digest does not match the content; {ADVICE}")
+    if ("node_stress" in arrays) != ("cell_stress" in arrays):
+        raise StoreError(f"{where}: has only one of the fields 'node_stress' and 'cell_stress'; {ADVICE}")
+    for conflict in size_conflicts(arrays, metadata.dim, len(metadata.param_names)):
+        raise StoreError(f"{where}: {conflict}; {ADVICE}")
+    shapes, names, is_prediction, begins = shapes_of(group), node_types_of(group), PREDICTION in group.attrs, start_time_of(group)
+    openings = openings_of(group)
     for key, violation in metadata.violations():
-        raise UnsoundError(f"{path}:{name}", f"{key} {violation}")
+        raise UnsoundError(where, f"{key} {violation}")
     if (wrong := shapes_fault(shapes, metadata.periodicity)) is not None:
-        raise UnsoundError(f"{path}:{name}", wrong)
+        raise UnsoundError(where, wrong)
     if (wrong := openings_fault(openings, metadata.dim, len(metadata.param_names), len(names))) is not None:
-        raise UnsoundError(f"{path}:{name}", wrong)
+        raise UnsoundError(where, wrong)
     for fault in faults(arrays, names, metadata.materials, metadata.param_names, first_frame):
-        raise UnsoundError(f"{path}:{name}", str(fault))
+        raise UnsoundError(where, str(fault))
     motion = BoundaryMotion(arrays["boundary_pos"], arrays["boundary_vel"], arrays["boundary_normal"])
     boundary = Boundary(
         motion.pos[0],

@@ -9,7 +9,7 @@ Keys are the arguments of ``Trajectory.from_numpy``, which documents them. ``par
 ``boundary_pos``, ``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` are arguments of ``Boundary.from_numpy``, or of
 ``Boundary.moving`` if ``boundary_pos`` is [frame, boundary_node, dim]. Then ``boundary_vel`` is ignored, and ``boundary_normal`` has either every frame or only
 the first. Without ``boundary_normal``, normals are estimated. Required keys are ``pos``, ``frame_dt``, ``materials`` and ``params_…``. Settings of the command
-override the files, except for the parameters that a file has.
+override the files, except for the parameters that a file has. Trajectories that this package exported as ``.npz`` are read too (``exported``).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl.data.importers import npz
+from gpe_pl.data.importers import exported, npz
 from gpe_pl.data.importers.source import (
     Facts,
     ImportFailure,
@@ -83,16 +83,19 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     files = {
         split: sorted(folder.glob("*.npz"), key=lambda file: natural(file.name)) for split, folder in (folders or {"train": path}).items()
     }
-    splits = {split: [Item(file.name, partial(_load, file)) for file in found] for split, found in files.items()}
+    given = Facts().overridden(settings)
+    splits = {split: [Item(file.name, partial(_load, file, given)) for file in found] for split, found in files.items()}
     splits = {split: items for split, items in splits.items() if items}
     if not splits:
         raise ImportFailure(f"{path}: {'no such folder' if not path.is_dir() else 'holds no *.npz'}")
-    return Source(Facts().overridden(settings), splits, warnings)
+    return Source(given, splits, warnings)
 
 
-def _load(path: Path, facts: Facts) -> Loaded:
+def _load(path: Path, given: Facts, facts: Facts) -> Loaded:
     try:
         names = npz.names(path)
+        if exported.KEY in names:
+            return exported.load(path, names, given)
         values: dict[str, Any] = {}
         for name in sorted(names, key="pos".__ne__):  # "pos" first, because it determines the number of nodes
             if name in KEYS or name.startswith(PREFIXES):

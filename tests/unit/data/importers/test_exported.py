@@ -1,0 +1,81 @@
+"""Import of trajectories that this package exported: they come back as they were."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset
+from gpe_pl.export.trajectories import write_npz
+from gpe_pl.trajectory.store import stored_arrays, stored_attributes
+from gpe_pl.trajectory.trajectory import Trajectory
+from tests.unit.data.importers.test_formats import imported
+
+Make = Callable[..., Trajectory]
+
+
+@pytest.fixture
+def scenes(new_trajectory: Make) -> list[Trajectory]:
+    """Make two trajectories, whose nodes move."""
+    made = [new_trajectory(seed, num_frames=8, num_nodes=12) for seed in range(2)]
+    steps = [np.random.default_rng(t.metadata.seed).normal(scale=3e-3, size=t.pos.shape) for t in made]
+    return [replace(t, pos=(t.pos[0] + np.cumsum(s, axis=0)).astype(np.float32)) for t, s in zip(made, steps, strict=True)]
+
+
+def exported(folder: Path, scenes: list[Trajectory]) -> Path:
+    folder.mkdir()
+    for number, trajectory in enumerate(scenes):
+        write_npz(folder / f"{number}.npz", trajectory)
+    return folder
+
+
+def test_exported_trajectories_come_back(tmp_path: Path, scenes: list[Trajectory]) -> None:
+    report, stored = imported(tmp_path, exported(tmp_path / "raw", scenes), "arrays", holdout=0.0)
+    assert not report.refusals
+    for before, after in zip(scenes, stored["train"], strict=True):
+        own, found = stored_arrays(before), stored_arrays(after)
+        assert own.keys() == found.keys()
+        for name, array in own.items():
+            np.testing.assert_array_equal(found[name], array, err_msg=name)
+        assert stored_attributes(after)["shapes"] == stored_attributes(before)["shapes"]
+        assert after.metadata.param_names == before.metadata.param_names
+        assert (after.metadata.bounds, after.metadata.gravity) == (before.metadata.bounds, before.metadata.gravity)
+
+
+def refusal(folder: Path, **settings: object) -> str:
+    with pytest.raises(ImportFailure) as failure:
+        import_dataset(folder.parent / "data", ImportSettings("arrays", str(folder), "set", **settings))  # type: ignore[arg-type]
+    return str(failure.value)
+
+
+def test_a_setting_that_the_archive_states_is_refused(tmp_path: Path, scenes: list[Trajectory]) -> None:
+    folder = exported(tmp_path / "raw", scenes)
+    assert "states gravity itself; leave gravity out of the command" in refusal(folder, gravity=[0.0, -1.0])
+
+
+def changed(folder: Path, **arrays: np.ndarray) -> Path:
+    """Replace arrays of the only archive of a folder."""
+    path = folder / "0.npz"
+    with np.load(path) as archive:
+        values = {name: archive[name] for name in archive.files}
+    np.savez(path, allow_pickle=False, **{**values, **arrays})
+    return folder
+
+
+def test_damage_is_named(tmp_path: Path, scenes: list[Trajectory]) -> None:
+    pos = scenes[0].pos.copy()
+    pos[3, 5] = np.nan
+    for name, array, message in (
+        ("pos", pos, "frame 3, node 5"),
+        ("pos", scenes[0].pos.astype(np.float64), "field 'pos' is float64[8, 12, 2], expected float32"),
+        ("metadata", np.array("{}"), "metadata unreadable"),
+        ("metadata", np.array([1.0]), "metadata is float64[1], expected text"),
+        ("colour", np.array([1.0]), "has an unknown key 'colour'"),
+    ):
+        folder = tmp_path / f"{name}_{array.dtype}_{array.size}"
+        assert message in refusal(changed(exported(folder, scenes[:1]), **{name: array})), name
+        assert not list(tmp_path.glob("**/trajectory"))
