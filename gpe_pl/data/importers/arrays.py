@@ -91,11 +91,11 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     return Source(given, splits, warnings)
 
 
-def _load(path: Path, given: Facts, facts: Facts) -> Loaded:
+def _load(path: Path, stated: Facts, facts: Facts) -> Loaded:
     try:
         names = npz.names(path)
         if exported.KEY in names:
-            return exported.load(path, names, given)
+            return exported.load(path, names, stated)
         values: dict[str, Any] = {}
         for name in sorted(names, key="pos".__ne__):  # "pos" first, because it determines the number of nodes
             if name in KEYS or name.startswith(PREFIXES):
