@@ -415,8 +415,8 @@ def _open_records(prediction: Trajectory, ground_truth: Trajectory, horizons: Se
 
 
 class OneStepNMSE(Metric):
-    """Normalised mean squared one-step error, ``sum |prediction - target|² / sum |target|²`` over all nodes. It is 0 for a perfect model and 1 if zero is
-    predicted.
+    """Normalised mean squared one-step error, ``sum |prediction - target|² / sum |target|²`` over all nodes and axes. It is 0 for a perfect model and 1 if
+    zero is predicted.
 
     Unlike a training loss it does not depend on the training noise, so models trained with different noise can be compared.
     """
@@ -433,8 +433,8 @@ class OneStepNMSE(Metric):
         for name in ("squared_error", "squared_target"):
             self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
 
-    def update(self, prediction: Float[Tensor, "node dim"], target: Float[Tensor, "node dim"]) -> None:
-        """Add a batch of nodes. Prediction and target have the same unit."""
+    def update(self, prediction: Float[Tensor, "*values"], target: Float[Tensor, "*values"]) -> None:
+        """Add the values of a batch, such as those that ``predicted_rows`` returns. Prediction and target have the same unit."""
         if prediction.shape != target.shape:  # broadcasting would give a wrong number without an error
             raise ValueError(f"prediction {list(prediction.shape)} and target {list(target.shape)} differ in shape")
         prediction, target = prediction.detach().double(), target.detach().double()
