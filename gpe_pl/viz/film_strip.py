@@ -58,7 +58,8 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
     has_bar = coloring.bar_label is not None and len(rows) > first_with_bar
     legend = coloring.legend(trajectories)
     aspect = Camera(trajectories[0]).aspect
-    right = 0.04 if not has_bar else 0.62 if coloring.by == "error" else 0.9  # inch; the label of a stress includes its unit
+    with_bar = 0.74 if coloring.by == "error" else 0.9  # inch; errors have up to six characters, stresses include the unit
+    right = with_bar if has_bar else 0.04
     caption = textwrap.fill(
         "; ".join([in_common(trajectories), *["colour: height at the start"] * (coloring.by == "height")]), int(TEXT_WIDTH / CHARACTER)
     )

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -62,6 +64,16 @@ def test_error_colours_grow_with_the_error(ground_truth, prediction, dim):
     brightness = axes.collections[0].get_facecolor()[:, :3].sum(axis=1)
     error = np.linalg.norm(prediction.pos[-1] - ground_truth.pos[-1], axis=-1)
     assert brightness[error.argmax()] > brightness[error.argmin()] + 0.5
+
+
+@pytest.mark.parametrize("size", [0.0123, 0.0234, 0.123])
+def test_the_label_of_the_error_bar_is_within_the_figure(ground_truth, size):
+    moved = replace(ground_truth, pos=ground_truth.pos + np.float32(size / 2**0.5), is_prediction=True)
+    figure = rollout_figure(ground_truth, {"GPE": moved})
+    figure.canvas.draw()
+    bar = figure.axes[-1]
+    assert bar.get_ylabel() == "position error [m]"
+    assert bar.get_tightbbox().x1 <= figure.bbox.x1
 
 
 def test_a_stopped_rollout_says_so(ground_truth, stopped):
