@@ -34,6 +34,7 @@ from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, claim, without_tables
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned.least_distance import distance_in
 from gpe_pl.learned.pretrained import fingerprint
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.transfer import check_model
@@ -48,6 +49,7 @@ from gpe_pl.training.optimizer import train_only
 from gpe_pl.training.parallel import end_later_processes
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, seed, set_up, train
 from gpe_pl.training.tracking import LoggerSettings, publish
+from gpe_pl.trajectory.store import iter_trajectories
 
 log = logging.getLogger(__name__)
 
@@ -268,6 +270,8 @@ class FitRun:
         simulator = LearnedSimulator(self.new_model(spec=data.builder.spec), data.builder, data.stride)
         sample = data.statistics_sample()
         simulator.fit_statistics(sample, data.parameter_ranges(), data.trained_scene(), data.trained_scales())
+        if training.least_distance is not None:
+            simulator.least_distance = distance_in(iter_trajectories(self.root, "train"), training.least_distance)
         neighbors = mean_num_neighbors(sample, data.builder.spec.materials) if training.neighbor_weight is not None else 1.0
         if self.start is not None:
             new = simulator.start_from(self.start).new

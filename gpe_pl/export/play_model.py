@@ -73,6 +73,8 @@ def check(simulator: LearnedSimulator) -> None:
         wrong = f"a model with {' '.join(different)}"
     elif model.settings["material_embedding"] == "mlp":
         wrong = "a model with model.material_embedding=mlp"
+    elif simulator.least_distance:
+        wrong = "a model with a least distance of liquid nodes"
     elif builder.config.features != "contact" or not builder.config.boundary_condition:
         wrong = "a model without contact features"
     elif not all(trained.isfinite().all() for _, trained in simulator.trained_ranges()):

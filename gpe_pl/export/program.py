@@ -30,6 +30,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.graphs.features import history_of
 from gpe_pl.graphs.topology import IslandTopology, MeshTopology, Topology, descent_of
+from gpe_pl.learned.least_distance import LeastDistanceError
 from gpe_pl.learned.next_states import accelerations
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.nn.elastic_bodies import CellError
@@ -294,12 +295,17 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
         ValueError: ``path`` has another file type.
         CellError: the model needs the cells of meshes, which a program does not take.
         MirrorAverageError: the simulator averages over mirror images, which a program does not.
+        LeastDistanceError: the simulator keeps a least distance of liquid nodes, which a program does not.
         NodeLoadError: the data set of the simulator has prescribed nodes or forces, or the model reads the stress, which a program does not take.
     """
     path = Path(path)
     if simulator.mirror_average:
         raise MirrorAverageError(
             "exported programs do not average over mirror images; choose evaluation.mirror_average=false to export the model without"
+        )
+    if simulator.least_distance:
+        raise LeastDistanceError(
+            "exported programs keep no least distance; set least_distance of the simulator to 0 to export the model without"
         )
     if simulator.builder.spec.cells:
         raise CellError("exported programs have no cells; export a model with model.elastic=false graph.cells=false")

@@ -17,7 +17,6 @@ from typing import Any, Unpack
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
@@ -29,9 +28,10 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
 from gpe_pl.graphs.standards import Standards
 from gpe_pl.graphs.topology import GraphError, Topology
-from gpe_pl.learned import next_states, training_ranges, transfer
+from gpe_pl.learned import next_states, rollout_settings, training_ranges, transfer
 from gpe_pl.learned.checkpoint_file import CheckpointError as CheckpointError
 from gpe_pl.learned.checkpoint_file import load_checkpoint, reason
+from gpe_pl.learned.least_distance import kept_apart
 from gpe_pl.learned.mirror_average import MirrorAverage
 from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.pretrained import checkpoint_path
@@ -72,11 +72,12 @@ class LearnedSimulator(nn.Module):
         static_friction: fraction of the speed that gravity gives in one frame. Nodes on a wall that are slower keep their positions (see
             ``nn.static_friction``). 0 switches this off.
         mirror_average: average each step of a rollout over the scene and its mirror images (see ``mirror_average``).
+        least_distance: liquid nodes that come nearer in a rollout are pushed apart [m] (see ``least_distance``). 0 switches this off.
         acceleration_std, stress_std: units of the model's accelerations [m/s²] and stresses [Pa].
         trained_scene, trained_mass: ranges in training, as in ``scene_ranges`` and ``training_ranges.outside_masses``.
         trained_scales: range in training, as in ``training_ranges.scale_range``. Only models with ``graph.scales`` other than ``one`` have it.
 
-    You may change the first four attributes at any time. Of them, ``save`` stores ``static_friction`` and ``mirror_average``.
+    You may change the first five attributes at any time. ``save`` stores the last three of them.
     """
 
     model: Model
@@ -87,6 +88,7 @@ class LearnedSimulator(nn.Module):
     trained_scales: Tensor
     clamps_parameters: bool = True
     mirror_average: bool = False
+    least_distance: float = 0.0
 
     def __init__(self, model: Model, builder: GraphBuilder, stride: int = 1) -> None:
         super().__init__()
@@ -100,7 +102,7 @@ class LearnedSimulator(nn.Module):
         self.register_buffer("acceleration_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("stress_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("trained_scene", torch.from_numpy(unlimited(builder.spec.dim)))
-        self.register_buffer("trained_mass", self._any_mass())
+        self.register_buffer("trained_mass", training_ranges.any_mass(self.builder.spec.materials))
         if builder.config.scales != "one":
             self.register_buffer("trained_scales", training_ranges.scale_range([builder.metadata]))
         for material, count in builder.spec.param_channels.items():
@@ -108,11 +110,8 @@ class LearnedSimulator(nn.Module):
                 f"trained_{material}", torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).expand(2, count).clone()
             )
 
-    def _any_mass(self) -> Float64[Tensor, "2 material"]:
-        return torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).repeat(1, len(self.builder.spec.materials))
-
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        state_dict.setdefault(f"{prefix}trained_mass", self._any_mass())  # shipped models lack it
+        state_dict.setdefault(f"{prefix}trained_mass", training_ranges.any_mass(self.builder.spec.materials))  # shipped models lack it
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
@@ -451,6 +450,8 @@ class LearnedSimulator(nn.Module):
             all_acc = next_states.accelerations(states, rows, acceleration, self.acceleration_std)
             new = [self.advance(state, acc) for state, acc in zip(states, all_acc, strict=True)]
         new = next_states.with_frame_velocity(new, rows, predicted.frame_velocity, dt)
+        if self.least_distance and not self.training:
+            new = [kept_apart(state, self.least_distance, dt) for state in new]
         if not predicted.stress or (self.training and not self.builder.spec.reads_stress):
             return new
         components = next(iter(self.builder.spec.stress_channels.values()))
@@ -537,6 +538,7 @@ class LearnedSimulator(nn.Module):
             "metadata": asdict(self.builder.reference or self.builder.metadata),
             "static_friction": self.static_friction,
             "mirror_average": self.mirror_average,
+            "least_distance": self.least_distance,
             "stride": self.stride,
         }
 
@@ -557,11 +559,7 @@ class LearnedSimulator(nn.Module):
         if type(stride) is not int or stride < 1:
             raise ValueError(f"stride {stride!r} is no integer of at least 1")
         simulator = cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder, stride)
-        simulator.static_friction = values.get("static_friction", 0.0)
-        if type(average := values.get("mirror_average", False)) is not bool:
-            raise ValueError(f"mirror_average={average!r}: must be true or false")
-        simulator.mirror_average = average
-        return simulator
+        return simulator.configured(**rollout_settings.stored(values))
 
     def save(self, path: Path | str) -> None:
         """Write weights and description, atomically, for ``from_checkpoint``. A training checkpoint also has the optimiser's state."""

@@ -51,6 +51,11 @@ def outside_parameters(state: State, metadata: Metadata, ranges: Iterable[tuple[
                 yield kind, f"{kind} is {spec.quantity(values[is_outside][0].item())}, trained were {low.item():g} to {high.item():g}"
 
 
+def any_mass(materials: Sequence[str]) -> Float64[Tensor, "2 material"]:
+    """Return the range of masses of each material that excludes none: the value before training."""
+    return torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).repeat(1, len(materials))
+
+
 def outside_masses(state: State, materials: Sequence[str], trained: Tensor) -> Iterator[tuple[str, str]]:
     """Yield the kind of each mass of a scene that is outside the range of training by more than ``MASS_FACTOR``, and a line that says so.
 

@@ -52,7 +52,7 @@ def described(model: str) -> Iterator[str]:
         f"history of {graph.history} frames"
     )
     settings = ", ".join(f"{key}={value}" for key, value in simulator.model.settings.items())
-    yield f"settings: {settings}; static_friction={simulator.static_friction:g}"
+    yield f"settings: {settings}; static_friction={simulator.static_friction:g}, least_distance={simulator.least_distance:.4g} m"
     yield "trained ranges (outside of them, a rollout warns):"
     yield from (f"  {name}: {values}" for name, values in simulator.described_training())
     suites: tuple[verdicts.Suite, ...] = ("acceptance", "stability")

@@ -64,6 +64,8 @@ class TrainingSettings:
         targets: targets of noisy and unrolled states, see ``Targets`` and ``data.solver_targets``.
         early_layers: train only the weights that ``start_from`` did not give, the embeddings of materials, the encoders, and this number of the first
             message-passing steps; None trains all weights.
+        least_distance: quantile of the distances of nearest liquid nodes in the training data. Rollouts of the model keep these nodes that far apart (see
+            ``learned.least_distance``); None keeps no distance.
         val_containment: put particles that cross a wall back on its surface in the validation rollouts, which choose the best checkpoint.
     """
 
@@ -97,6 +99,7 @@ class TrainingSettings:
     val_interval: Annotated[int, Field(ge=1)] = 1000
     num_val_rollouts: Annotated[int, Field(ge=1)] = 4
     val_rollout_steps: Annotated[int, Field(ge=1)] = 100
+    least_distance: Annotated[float, Field(ge=0, le=1)] | None = None
     val_containment: bool = True
 
     def __post_init__(self) -> None:

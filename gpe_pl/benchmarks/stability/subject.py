@@ -179,7 +179,8 @@ def in_double(simulator: LearnedSimulator) -> LearnedSimulator:
     """Return the simulator with the same weights in double precision, as a reference for rounding errors."""
     twin = _DoubleSimulator(copy.deepcopy(simulator.model), _DoubleBuilder(simulator.builder.config, simulator.builder.metadata))
     twin.load_state_dict(simulator.state_dict())
-    twin.static_friction, twin.mirror_average = simulator.static_friction, simulator.mirror_average
+    for name in ("static_friction", "mirror_average", "least_distance"):
+        setattr(twin, name, getattr(simulator, name))
     return twin.double().eval()
 
 
