@@ -17,12 +17,12 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.data.training_samples import UnrollStart, training_batch
 from gpe_pl.graphs.topology import Topology
-from gpe_pl.learned.approximate import Batched
+from gpe_pl.learned.differentiable import Differentiable
 from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.base import Prediction
 from gpe_pl.rollout.flow import through_openings
-from gpe_pl.rollout.loop import SimulationError, step_scenes
+from gpe_pl.rollout.loop import step_scenes
 from gpe_pl.system import ranks
 from gpe_pl.trajectory.state import State, Stress
 
@@ -191,16 +191,6 @@ def _located(simulator: LearnedSimulator, scale: tuple[float, float] | None) -> 
     return simulator if scale is None else simulator.at(*scale)
 
 
-@dataclass(frozen=True)
-class _Trainable(Batched):
-    """A learned simulator whose states can be used in training. States from ``LearnedSimulator.step_all`` can be used for inference only."""
-
-    simulator: LearnedSimulator
-
-    def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        return self.simulator.next_states(states)
-
-
 @torch.no_grad()
 def unrolled(simulator: LearnedSimulator, starts: Sequence[UnrollStart]) -> tuple[list[State], list[int]]:
     """Return states after unrolling each start for ``num_steps`` steps, all starts together, and the number of steps of each.
@@ -212,7 +202,7 @@ def unrolled(simulator: LearnedSimulator, starts: Sequence[UnrollStart]) -> tupl
     was_training, simulator = simulator.training, _located(simulator, starts[0].scale)
     simulator.eval()
     try:
-        for k, step, item in step_scenes(_Trainable(simulator), dict(enumerate(states)), num_steps):
+        for k, step, item in step_scenes(Differentiable(simulator), dict(enumerate(states)), num_steps):
             if isinstance(item, State):
                 states[k], steps[k] = item, step
     finally:

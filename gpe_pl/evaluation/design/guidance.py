@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpe_pl.evaluation.checkpointed import Checkpointed
 from gpe_pl.evaluation.design.pose import NAMES, Obstacle
+from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.rollout.loop import Simulator, step_scenes
 from gpe_pl.trajectory.state import State
 
 
@@ -63,22 +62,23 @@ class Guidance:
         """Return the misfit at numbers from 0 to 1 [unknown]."""
         self.num_evaluations += 1
         with torch.no_grad():
-            return float(self._misfit(self.simulator, torch.tensor(np.asarray(z, dtype=np.float64))))
+            return float(self._misfit(torch.tensor(np.asarray(z, dtype=np.float64))))
 
     def misfit_and_gradient(self, z: Sequence[float] | np.ndarray) -> tuple[float, np.ndarray]:
         """Return the misfit and its gradient. The gradient of a rollout that fails is zero."""
         self.num_gradients += 1
         at = torch.tensor(np.asarray(z, dtype=np.float64), requires_grad=True)
         with torch.enable_grad():
-            misfit = self._misfit(Checkpointed(self.simulator), at)
+            misfit = self._misfit(at)
             gradient = torch.autograd.grad(misfit, at)[0].numpy() if misfit.requires_grad else np.zeros(len(at))
         return float(misfit.detach()), gradient
 
-    def _misfit(self, simulator: Simulator, z: Tensor) -> Tensor:
-        last: State | None = None
-        for _, frame, item in step_scenes(simulator, {0: self.obstacle.moved(self.state, self._pose(z))}, {0: self.num_frames}):
-            last = item if isinstance(item, State) and frame == self.num_frames else None
-        square = None if last is None else squared_distance(last.pos, torch.from_numpy(self.target))
+    def _misfit(self, z: Tensor) -> Tensor:
+        def last(_: int, frame: int, state: State) -> Tensor | None:
+            return squared_distance(state.pos, torch.from_numpy(self.target)) if frame == self.num_frames else None
+
+        start = self.obstacle.moved(self.state, self._pose(z))
+        square = rollout_scores(self.simulator, {0: start}, self.num_frames, last).get((0, self.num_frames))
         if square is None or not bool(square < self.failed):
             return torch.tensor(math.log(self.failed), dtype=torch.float64)
         return torch.log(square)

@@ -18,11 +18,11 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
 
 from gpe_pl.errors import GpeError
-from gpe_pl.evaluation.checkpointed import Checkpointed
 from gpe_pl.evaluation.identification.observations import Observations
 from gpe_pl.evaluation.identification.unknowns import Unknowns
+from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.rollout.loop import Restartable, Simulator, step_scenes
+from gpe_pl.rollout.loop import Restartable, Simulator
 from gpe_pl.trajectory.state import State
 
 FLOOR = 1e-6
@@ -87,7 +87,7 @@ class Shooting:
         self.num_evaluations += 1
         with torch.no_grad():
             z = np.asarray(z, dtype=np.float64)
-            errors = self._errors(self.simulator, torch.from_numpy(z) if isinstance(self.simulator, LearnedSimulator) else z)
+            errors = self._errors(torch.from_numpy(z) if isinstance(self.simulator, LearnedSimulator) else z)
         return np.array([[float(e) for e in window] for window in errors])
 
     def misfit_and_gradient(self, z: Sequence[float] | np.ndarray) -> tuple[float, Float64[np.ndarray, "unknown"]]:
@@ -101,7 +101,7 @@ class Shooting:
         self.num_gradients += 1
         at = torch.tensor(np.asarray(z, dtype=np.float64), requires_grad=True)
         with torch.enable_grad():
-            errors = self._errors(Checkpointed(self.simulator), at)
+            errors = self._errors(at)
             rows = [torch.stack([torch.as_tensor(e, dtype=torch.float64) for e in window]) for window in errors]
             terms = torch.stack(rows)
             is_known = ~terms.isnan()
@@ -111,27 +111,27 @@ class Shooting:
             (gradient,) = torch.autograd.grad(misfit, at)
         return misfit.item(), gradient.numpy()
 
-    def _errors(self, simulator: Simulator, z: Any) -> list[list[Any]]:
+    def _errors(self, z: Any) -> list[list[Any]]:
         states = {frame: self.unknowns.applied(state, z) for frame, state in self.starts.items()}
         errors: dict[int, list[Any]] = {frame: [FAILED] * self.length for frame in states}
         for frame in states:
             for k in range(1, self.length + 1):
                 if not self.observations.seen[frame + k].any():
                     errors[frame][k - 1] = np.nan
-        spacing = self.observations.trajectory.metadata.spacing
-        for start, k, item in step_scenes(simulator, states, dict.fromkeys(states, self.length)):
-            if isinstance(item, State) and self.observations.seen[start + k].any():
-                rows, target = self._target(start, k, item.pos)
-                difference = item.periodicity.shortest(item.pos[rows] - target) / spacing
-                error = (difference**2).sum() / len(target)
-                errors[start][k - 1] = error if bool(error < FAILED) else FAILED  # also if it is NaN
+        for (start, k), error in rollout_scores(self.simulator, states, self.length, self._error).items():
+            errors[start][k - 1] = error if bool(error < FAILED) else FAILED  # also if it is NaN
         return list(errors.values())
 
-    def _target(self, start: int, k: int, like: Any) -> tuple[Any, Any]:
-        """Return rows and positions of the nodes observed in frame ``k`` after a start, as arrays or tensors like ``like``.
+    def _error(self, start: int, k: int, state: State) -> Any:
+        """Return the mean squared displacement in frame ``k`` after a start [spacings²], or None if nothing is observed."""
+        if not self.observations.seen[start + k].any():
+            return None
+        rows, target = self._target(start, k, state.pos)
+        difference = state.periodicity.shortest(state.pos[rows] - target) / self.observations.trajectory.metadata.spacing
+        return (difference**2).sum() / len(target)
 
-        Rows of all nodes are a slice, so that gradients store no numbers of nodes.
-        """
+    def _target(self, start: int, k: int, like: Any) -> tuple[Any, Any]:
+        """Return rows and positions of the nodes observed in frame ``k`` after a start, as arrays or tensors like ``like``."""
         seen = self.observations.seen[start + k]
         rows: Any = slice(None) if seen.all() else np.flatnonzero(seen)
         target: Any = self.observations.trajectory.pos[start + k, rows].astype(np.float64)

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl.evaluation import checkpointed
-from gpe_pl.evaluation.checkpointed import Checkpointed
+from gpe_pl.evaluation import rollout_scores as rollout_scores_module
 from gpe_pl.evaluation.identification.answer import Answer, pairs_of, read_answers, side_by_side
 from gpe_pl.evaluation.identification.calibration import FewScenesError, Pairs, calibrated
 from gpe_pl.evaluation.identification.gradient_check import GradientCheck, gradient_check
@@ -22,10 +21,11 @@ from gpe_pl.evaluation.identification.scene import SolverError, identify, solver
 from gpe_pl.evaluation.identification.search import SearchSettings
 from gpe_pl.evaluation.identification.shooting import Shooting, ShootingError, ShootingSettings, shooting
 from gpe_pl.evaluation.identification.unknowns import UnknownError, unknowns_of
+from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.conformal import interval_score
 from gpe_pl.models.gpe import GPE
-from gpe_pl.rollout.loop import SimulationError, rollout, step_scenes
+from gpe_pl.rollout.loop import SimulationError, rollout
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests import scenes
@@ -190,50 +190,68 @@ def test_bounds_of_training_do_not_clamp() -> None:
     assert gradients_of(simulator, seen).misfit_and_gradient([0.9])[1][0] != 0
 
 
-def test_checkpointed_steps_have_the_gradients_of_plain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also those of walls, which a step leaves as they are, and over several segments."""
-    monkeypatch.setattr(checkpointed, "SEGMENT", 2)
-    simulator, seen = learned()
+def squares(_: int, frame: int, state: State) -> torch.Tensor | None:
+    """Return a score of every frame but the second."""
+    return None if frame == 2 else (1e3 * state.pos**2).sum()
+
+
+def leaves_and_start(simulator: LearnedSimulator, seen: Trajectory) -> tuple[list[torch.Tensor], State]:
+    """Return tensors with gradients, and a state that depends on them: its material parameters and its walls."""
     start = simulator.initial_state(seen, 5)
+    leaves = [start.material_params.clone().requires_grad_(), start.boundary.pos.clone().requires_grad_()]
+    return leaves, replace(start, material_params=1 * leaves[0], boundary=replace(start.boundary, pos=1 * leaves[1]))
 
-    def gradients(advanced: Any) -> list[torch.Tensor]:
-        leaves = [start.material_params.clone().requires_grad_(), start.boundary.pos.clone().requires_grad_()]
-        walls = replace(start.boundary, pos=1 * leaves[1])
-        states: list[Any] = [replace(start, material_params=1 * leaves[0], boundary=walls)]
-        for _ in range(5):
-            states = advanced(states)
-        found = torch.autograd.grad((states[0].pos ** 2).sum(), leaves)
-        assert all(torch.isfinite(g).all() and g.abs().max() > 0 for g in found)
-        return list(found)
 
-    plain = gradients(simulator.next_states)
-    for own, expected in zip(gradients(Checkpointed(simulator).step_all), plain, strict=True):
+@pytest.mark.parametrize("num_steps", [1, 5, 9])
+def test_scores_have_the_gradients_of_plain_rollouts(num_steps: int) -> None:
+    """Also those of walls, which a step leaves as they are, with frames that have no score, and in several segments."""
+    simulator, seen = learned()
+    leaves, start = leaves_and_start(simulator, seen)
+    states: list[Any] = [start]
+    plain = dict[tuple[int, int], torch.Tensor]()
+    for frame in range(1, num_steps + 1):
+        states = simulator.next_states(states)
+        if (value := squares(0, frame, states[0])) is not None:
+            plain[0, frame] = value
+    found = rollout_scores(simulator, {0: start}, num_steps, squares)
+    assert found.keys() == plain.keys()
+    totals = [sum(scores[0, frame] * frame for _, frame in plain) for scores in (found, plain)]
+    own, expected = (torch.autograd.grad(total, leaves, retain_graph=True) for total in totals)
+    for one, other in zip(own, expected, strict=True):
+        assert torch.isfinite(other).all() and other.abs().max() > 0
+        assert torch.allclose(one, other, rtol=1e-6, atol=1e-12)
+
+
+def test_scenes_of_a_batch_keep_their_gradients_where_one_fails() -> None:
+    simulator, seen = learned()
+    leaves, start = leaves_and_start(simulator, seen)
+    failing = replace(start, pos=start.pos * torch.nan)
+    alone = rollout_scores(simulator, {3: start}, 4, squares)
+    together = rollout_scores(simulator, {1: failing, 3: start}, 4, squares)
+    assert together.keys() == alone.keys()
+    for key in alone:
+        (own,), (expected,) = (torch.autograd.grad(scores[key], leaves[:1], retain_graph=True) for scores in (together, alone))
         assert torch.allclose(own, expected, rtol=1e-6, atol=1e-12)
 
 
-def test_memory_does_not_grow_with_the_activations_of_a_horizon() -> None:
+def test_only_scores_are_kept_for_gradients_and_states_of_few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator, seen = learned()
+    _, start = leaves_and_start(simulator, seen)
+    runs = list[rollout_scores_module._Run]()
+    forward = rollout_scores_module._Run.forward
+    monkeypatch.setattr(rollout_scores_module._Run, "forward", lambda run: (runs.append(run), forward(run))[1])
+    sizes: list[int] = []
 
-    def saved(advanced: LearnedSimulator | Checkpointed, num_steps: int) -> int:
-        sizes: list[int] = []
+    def pack(tensor: torch.Tensor) -> torch.Tensor:
+        sizes.append(tensor.numel())
+        return tensor
 
-        def pack(tensor: torch.Tensor) -> torch.Tensor:
-            sizes.append(tensor.numel())
-            return tensor
-
-        start = simulator.initial_state(seen, 5)
-        parameter = start.material_params.clone().requires_grad_()
-        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor), torch.enable_grad():
-            if isinstance(advanced, LearnedSimulator):
-                state = replace(start, material_params=parameter)
-                for _ in range(num_steps):
-                    (state,) = advanced.next_states([state])  # type: ignore[assignment]
-            else:
-                list(step_scenes(advanced, {0: replace(start, material_params=parameter)}, {0: num_steps}))
-        return sum(sizes)
-
-    assert saved(simulator, 3) > 1.5 * saved(simulator, 1) > 1000
-    assert saved(Checkpointed(simulator), 3) < 0.1 * saved(simulator, 3)
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        rollout_scores(simulator, {0: start}, 9, squares)
+        assert not sizes
+        simulator.next_states([start])
+    assert sum(sizes) > 1000
+    assert [*runs[0].stored] == [0, 3, 6]
 
 
 def test_the_check_refuses_gradients_of_the_wrong_sign_or_size() -> None:
