@@ -6,6 +6,8 @@ where all of it comes from (``provenance.json``). It keeps the results of single
 RUN_FOLDER may also hold several evaluations by ``evaluate``, and their table by ``python -m gpe_pl.reports RUN_FOLDER``.
 ``python docs/embed_results.py --renew SUITE_FOLDER NAME [NOTE]`` renews the models that a run of ``suite=acceptance`` or ``suite=stability`` measured, and
 keeps what ``docs/results/NAME`` has of other models.
+``python docs/embed_results.py --add RUN_FOLDER NAME [NOTE]`` does the same as without ``--add`` for a run that added models to a table which has others. The
+sessions of these are kept.
 ``python docs/embed_results.py`` only renews the README and the list in ``docs/results/README.md``; ``--check`` fails if one differs from the files.
 """
 
@@ -60,10 +62,11 @@ def embedded(text: str) -> str:
     return BLOCK.sub(lambda m: m[1] + (DOCS.parent / m[2]).read_text().rstrip() + "\n" + m[3], text)
 
 
-def collect(run: Path, name: str, note: str = "") -> None:
-    """Copy what is worth citing of a run into ``docs/results/{name}``."""
+def collect(run: Path, name: str, note: str = "", adds: bool = False) -> None:
+    """Copy what is worth citing of a run into ``docs/results/{name}``, and keep the sessions of earlier runs there if it adds to them."""
     target = RESULTS / name
     target.mkdir(parents=True, exist_ok=True)
+    before = sealed.read(target / PROVENANCE, ADVICE)["sessions"] if adds else []
     runs = finished_runs(run)
     is_table1 = (run / "table1.csv").exists()
     for pattern in FILES:
@@ -85,7 +88,7 @@ def collect(run: Path, name: str, note: str = "") -> None:
         archive([replace(found, rows=found.rows[found.rows["horizon"] == "full"]) for found in evaluations], run, target)
     seeds = sorted({int(found.config["seed"]) for found in runs if "seed" in found.config})
     every = sessions(run) or [session for found in evaluations for session in sessions(found.folder)]
-    sealed.write(target / PROVENANCE, {"sessions": every, "seeds": seeds, "note": note})
+    sealed.write(target / PROVENANCE, {"sessions": [*before, *every], "seeds": seeds, "note": note})
 
 
 def renew(run: Path, name: str, note: str = "") -> None:
@@ -193,6 +196,8 @@ def main(arguments: list[str]) -> int:
         return int(any(path.read_text() != text for path, text in pages().items()))
     if arguments[:1] == ["--renew"]:
         renew(Path(arguments[1]), *arguments[2:])
+    elif arguments[:1] == ["--add"]:
+        collect(Path(arguments[1]), *arguments[2:], adds=True)
     elif arguments:
         collect(Path(arguments[0]), *arguments[1:])
     for path, text in pages().items():

@@ -3,14 +3,17 @@
 ``python docs/rollout_bands.py FOLDER snow elastomer …`` takes shipped models whose data sets have their names; ``sand=FILE.ckpt`` takes another checkpoint.
 For each model it generates scenes that no training had, and runs ``evaluate`` three times: on the split ``val`` to calibrate bands, which are stored beside
 the checkpoint, and on ``test`` and ``test_unseen`` to measure their coverage. Data and evaluations go to FOLDER. Finished evaluations are not repeated.
-``docs/embed_results.py FOLDER/runs bands`` copies the results, and ``docs/rollout_bands.py --cards FOLDER snow elastomer …`` writes them into the cards of
-shipped models.
+Table and figure also have the models of ``docs/results/bands`` that are not named.
+``docs/embed_results.py --add FOLDER/runs bands`` copies the results, and ``docs/rollout_bands.py --cards FOLDER snow elastomer …`` writes them into the cards
+of shipped models.
 """
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +39,8 @@ NEW_SCENES = (
 )
 GROUPS = {"seen": "seen", "interpolated": "interpolated", "extrapolated": "outside the trained range"}
 """Names of the groups of material parameters."""
+EMBEDDED = Path(__file__).resolve().parent / "results" / "bands" / "table.md"
+"""Table in the documentation."""
 OPENING = "Its error bands of"
 """Beginning of the paragraph of a card."""
 ACCEPTED = (85, 95)
@@ -69,11 +74,11 @@ def values(rows: list[Row], metric: str, group: str) -> dict[str, list[float]]:
     return {horizon: found[horizon] for horizon in sorted(found, key=time_of)}
 
 
-def lines_of(name: str, checkpoint: str, rows: list[Row]) -> list[str]:
+def cells_of(name: str, checkpoint: str, rows: list[Row]) -> list[list[str]]:
     """Return the rows of the table of one model."""
     own, spacing = bands.read(checkpoint), LearnedSimulator.from_checkpoint(checkpoint).builder.metadata.spacing
     assert own is not None
-    lines = []
+    found = []
     for group, label in GROUPS.items():
         inside, enough, radii = (values(rows, metric, group) for metric in ("fraction_in_bands", "enough_in_bands", "band_radius"))
         for horizon, fractions in inside.items():
@@ -86,8 +91,8 @@ def lines_of(name: str, checkpoint: str, rows: list[Row]) -> list[str]:
                 *(f"{100 * np.mean(enough[horizon]):.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %"),
                 f"{np.mean(radii[horizon]) / spacing:.3g}",
             ]
-            lines.append(table_row(cells))
-    return lines
+            found.append(cells)
+    return found
 
 
 def write_card(folder: Path, name: str) -> None:
@@ -107,17 +112,22 @@ def sentence(rows: list[Row]) -> str:
     return f"{OPENING} {100 * bands.LEVEL:g} % contain these fractions of the nodes after 0.1 s and at the end of rollouts: {'; '.join(parts)}."
 
 
-def draw(axes: Axes, name: str, rows: list[Row]) -> None:
-    """Draw the coverage of bands of one model at each horizon, with a line per group."""
+def kept_cells(models: Iterable[str]) -> list[list[str]]:
+    """Return the rows of the table in the documentation that are of other models."""
+    rows = [[cell.strip() for cell in line.strip("| ").split("|")] for line in EMBEDDED.read_text().splitlines()[2:]]
+    return [cells for cells in rows if cells[0] not in models]
+
+
+def draw(axes: Axes, name: str, rows: list[list[str]]) -> None:
+    """Draw the coverage of bands of one model at each horizon, with a line per group, from its rows of the table."""
     axes.axhspan(*ACCEPTED, color="0.92", linewidth=0)
     axes.axhline(100 * bands.LEVEL, color="0.5", linewidth=1, linestyle=":")
-    for k, (group, label) in enumerate(GROUPS.items()):
-        inside = values(rows, "fraction_in_bands", group)
-        found = [bootstrap_interval([fractions], statistic=np.mean) for fractions in inside.values()]
-        low, middle, high = 100 * np.array([[each.low, each.estimate, each.high] for each in found]).T
-        place, color = np.arange(len(inside)) + 0.12 * (k - 1), PALETTE[k]
+    for k, label in enumerate(GROUPS.values()):
+        own = [cells for cells in rows if cells[1] == label]
+        middle, low, high = np.array([[float(number) for number in re.findall(r"[\d.]+", cells[4])] for cells in own]).T
+        place, color = np.arange(len(own)) + 0.12 * (k - 1), PALETTE[k]
         axes.errorbar(place, middle, [middle - low, high - middle], fmt="o-", color=color, markersize=3, linewidth=1, label=label)
-        axes.set_xticks(range(len(inside)), [horizon.removesuffix("s") if horizon != FULL else "end" for horizon in inside])
+        axes.set_xticks(range(len(own)), ["end" if cells[3] == FULL else cells[3].removesuffix("s") for cells in own])
     axes.set_title(name, fontsize=8)
     axes.set_xlabel("time [s]", fontsize=7.5)
     axes.set_ylim(60, 101)
@@ -129,19 +139,20 @@ def main(folder: Path, models: dict[str, str]) -> None:
     """Measure what is missing, and write the table and the figure."""
     for name, checkpoint in models.items():
         measure(folder, name, checkpoint)
-    rows = {name: rows_of(folder, name) for name in models}
     head = [
         *("model", "material parameters", "scenes", "horizon", "nodes inside", f"within {ACCEPTED[0]} to {ACCEPTED[1]} %"),
         *("scenes with enough nodes inside", "by chance", "radius [spacings]"),
     ]
-    lines = [table_row(head), "|" + "---|" * len(head)]
-    lines += [line for name, checkpoint in models.items() for line in lines_of(name, checkpoint, rows[name])]
-    replace_text(folder / "runs" / "table.md", "\n".join([*lines, ""]))
-    figure = new_figure(2.1 * len(models) + 0.4, 2.4)
+    rows = kept_cells(models)
+    for name, checkpoint in models.items():
+        rows += cells_of(name, checkpoint, rows_of(folder, name))
+    replace_text(folder / "runs" / "table.md", "\n".join([table_row(head), "|" + "---|" * len(head), *map(table_row, rows), ""]))
+    names = [*dict.fromkeys(cells[0] for cells in rows)]
+    figure = new_figure(2.1 * len(names) + 0.4, 2.4)
     figure.set_layout_engine("constrained")
-    panels = np.ravel(figure.subplots(1, len(models), sharey=True, squeeze=False))
-    for axes, (name, own) in zip(panels, rows.items(), strict=True):
-        draw(axes, name, own)
+    panels = np.ravel(figure.subplots(1, len(names), sharey=True, squeeze=False))
+    for axes, name in zip(panels, names, strict=True):
+        draw(axes, name, [cells for cells in rows if cells[0] == name])
     panels[0].set_ylabel("nodes inside bands of 90 % [%]", fontsize=7.5)
     panels[0].legend(fontsize=6, frameon=False, loc="lower left")
     save_figure(figure, folder / "runs" / "bands.png", dpi=150)

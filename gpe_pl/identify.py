@@ -104,15 +104,15 @@ def scenes(path: Path, number: int | None) -> Iterator[tuple[str, Trajectory]]:
 
 def _calibrations(settings: Settings) -> dict[str, dict[str, Any]]:
     """Return the calibration of each simulator and unknown from an earlier results folder; empty without one."""
-    from gpe_pl.evaluation.identification.answer import MODEL, SOLVER, pairs_of, read_answers
+    from gpe_pl.evaluation.identification.answer import MODEL, SOLVER, known_of, read_answers
     from gpe_pl.evaluation.identification.calibration import calibrated
 
     if settings.calibration is None:
         return {}
     found = {}
     for simulator in (MODEL, SOLVER):
-        pairs = pairs_of(read_answers(Path(settings.calibration), simulator))
-        found[simulator] = {name: calibrated(own, settings.level) for name, own in pairs.items()}
+        known = known_of(read_answers(Path(settings.calibration), simulator))
+        found[simulator] = {name: calibrated(own, settings.level) for name, own in known.items()}
     if not any(found.values()):
         raise ConfigError(f"calibration={settings.calibration}: has no answers; name the results folder of an earlier run of this command")
     return found

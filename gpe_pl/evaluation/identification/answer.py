@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from gpe_pl.evaluation.identification.calibration import Calibration, Pairs
+from gpe_pl.errors import GpeError
+from gpe_pl.evaluation.identification.calibration import Calibration, Known
+from gpe_pl.evaluation.identification.profile import Profile
 from gpe_pl.evaluation.identification.unknowns import Unknown
 from gpe_pl.files import sealed
 
@@ -20,16 +20,20 @@ FOLDER = "scenes"
 """Subfolder of a results folder with one file per scene and simulator."""
 
 
+class AnswerError(GpeError, ValueError):
+    """Raised for a file with an answer that this version cannot read."""
+
+
 @dataclass(frozen=True)
 class Value:
     """Answer for one unknown.
 
     Attributes:
         name, label, unit, is_log: as in ``Unknown``.
-        raw: value with the smallest misfit.
-        scale: scale of its error, in coordinates (the value, or its natural logarithm if ``is_log``).
-        estimate, low, high: corrected value and ends of its interval.
-        at_bound: ``lower`` or ``upper`` if ``raw`` lies at a bound, else empty.
+        bounds: bounds of the search.
+        estimate: value with the smallest misfit.
+        low, high: ends of its interval.
+        at_bound: ``lower`` or ``upper`` if the estimate lies at a bound, else empty.
         truth: stored value; None if it is unknown.
         text: estimate with unit, and interval, for readers.
     """
@@ -38,8 +42,7 @@ class Value:
     label: str
     unit: str
     is_log: bool
-    raw: float
-    scale: float
+    bounds: tuple[float, float]
     estimate: float
     low: float
     high: float
@@ -50,6 +53,10 @@ class Value:
     @property
     def short(self) -> str:
         return self.text.partition(" (")[0]
+
+    def coordinate(self, value: float) -> float:
+        """Return the coordinate in which intervals are measured: the value, or its natural logarithm."""
+        return math.log(value) if self.is_log else value
 
 
 @dataclass(frozen=True)
@@ -108,9 +115,16 @@ def answer_path(folder: Path, scene: str, simulator: str) -> Path:
 
 
 def read_answer(path: Path) -> Answer:
-    """Read an answer that ``Answer.write`` wrote; raises ``SealError`` if the file was changed."""
+    """Read an answer that ``Answer.write`` wrote.
+
+    Raises:
+        SealError: the file was changed.
+        AnswerError: another version of the package wrote it.
+    """
     found: dict[str, Any] = sealed.read(path, ADVICE)
-    values = tuple(Value(**value) for value in found.pop("values"))
+    if any(value.keys() != Value.__dataclass_fields__.keys() for value in found["values"]):
+        raise AnswerError(f"{path}: is an answer of another version; {ADVICE}")
+    values = tuple(Value(**{**value, "bounds": tuple(value["bounds"])}) for value in found.pop("values"))
     return Answer(values=values, tried=tuple(map(tuple, found.pop("tried"))), **found)
 
 
@@ -119,35 +133,35 @@ def read_answers(folder: Path, simulator: str) -> list[Answer]:
     return [read_answer(path) for path in sorted((folder / FOLDER).glob(f"*_{simulator}.json"))]
 
 
-def value_of(unknown: Unknown, raw: float, z: float, scale: float, calibration: Calibration) -> Value:
+def value_of(unknown: Unknown, z: float, profile: Profile, calibration: Calibration) -> Value:
     """Return the answer for an unknown.
 
     Args:
         unknown: the unknown.
-        raw: its value with the smallest misfit.
-        z: the same as a number from 0 to 1.
-        scale: scale of the error, in coordinates.
-        calibration: correction and interval.
+        z: its value with the smallest misfit, as a number from 0 to 1.
+        profile: misfits of other values.
+        calibration: width of the interval.
     """
-    estimate, low, high = map(unknown.value, calibration.interval(unknown.coordinate(raw), scale))
+    estimate = float(unknown.at(z))
+    low, high = map(unknown.value, profile.within(calibration.threshold))
     text = f"{unknown.text(estimate)} ({100 * calibration.level:g} %: {low:.3g}–{high:.3g})"
     if unknown.unit == "Pa":
         text = f"{unknown.text(estimate)} ({100 * calibration.level:g} %: {unknown.text(low)}–{unknown.text(high)})"
-    truth = unknown.truth if math.isfinite(unknown.truth) else None
-    return Value(
-        unknown.name, unknown.label, unknown.unit, unknown.is_log, raw, scale, estimate, low, high, unknown.bound_of(z), truth, text
-    )  # fmt: skip
+    truth, bounds = unknown.truth if math.isfinite(unknown.truth) else None, (unknown.low, unknown.high)
+    return Value(unknown.name, unknown.label, unknown.unit, unknown.is_log, bounds, estimate, low, high, unknown.bound_of(z), truth, text)
 
 
-def pairs_of(answers: Iterable[Answer]) -> dict[str, Pairs]:
-    """Return estimates, true values and scales by name of the unknown, in coordinates, of all answers whose truth is known."""
-    found: dict[str, list[tuple[float, float, float]]] = {}
+def known_of(answers: Iterable[Answer]) -> dict[str, list[Known]]:
+    """Return answers whose truth is known, by name of the unknown. All bodies of a scene count as the same unknown."""
+    found: dict[str, list[Known]] = {}
     for answer in answers:
-        for value in answer.values:
+        for k, value in enumerate(answer.values):
             if value.truth is not None:
-                change = math.log if value.is_log else float
-                found.setdefault(value.name.partition("#")[0], []).append((change(value.raw), change(value.truth), value.scale))
-    return {name: Pairs(*np.array(rows).T) for name, rows in found.items()}
+                low, high = map(value.coordinate, value.bounds)
+                profile = Profile.of(((value.coordinate(row[k]), row[-1]) for row in answer.tried), (low, high))
+                known = Known(value.coordinate(value.estimate), value.coordinate(value.truth), profile)
+                found.setdefault(value.name.partition("#")[0], []).append(known)
+    return found
 
 
 def side_by_side(answers: Mapping[str, Answer]) -> Sequence[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,12 +18,12 @@ from gpe_pl.evaluation.identification.answer import (
     Answer,
     Value,
     answer_path,
-    pairs_of,
+    known_of,
     read_answer,
     read_answers,
     side_by_side,
 )
-from gpe_pl.evaluation.identification.calibration import Calibration, intervals_without_own
+from gpe_pl.evaluation.identification.calibration import Calibration, cross_calibrated
 from gpe_pl.evaluation.identification.observations import Observations, ObservationSettings
 from gpe_pl.evaluation.identification.pictures import misfit_figure
 from gpe_pl.evaluation.identification.scene import SolverError, identify, solver_bounds, solver_of, trained_bounds
@@ -105,7 +104,9 @@ class Task:
         number = min(SHOWN_FRAMES, trajectory.num_frames - 1 - first)
         shown: dict[str, Trajectory] = {}
         for kind, answer in answers.items():
-            z = np.array([(u.coordinate(v.raw) - u.coordinate(u.low)) / u.range for u, v in zip(sought.items, answer.values, strict=True)])
+            z = np.array(
+                [(u.coordinate(v.estimate) - u.coordinate(u.low)) / u.range for u, v in zip(sought.items, answer.values, strict=True)]
+            )
             simulator: Simulator = self.model if kind == MODEL else solver_of(trajectory.metadata)
             if kind == MODEL:
                 model = self.model.configured(clamps_parameters=False)
@@ -137,54 +138,48 @@ def write_table(folder: Path) -> str:
 
 
 HEAD = (
-    "unknown",
-    "simulator",
-    "calibration",
-    "scenes",
-    "median error",
-    "median relative error",
-    "bias",
-    "coverage",
-    "interval score",
-    "processor seconds",
+    *("unknown", "simulator", "calibration", "scenes", "at a bound", "median error", "median relative error", "mean error"),
+    *("coverage", "interval score", "processor seconds"),
 )
 
 
 def _summary(answers: Mapping[str, list[Answer]]) -> list[str]:
     """Return a table of errors per unknown and simulator, over scenes with a stored value.
 
-    If a run without calibration has enough scenes, further rows show what a calibration would give: each scene's answer is calibrated on the other scenes, with
-    intervals that follow its scale, and with intervals of one width.
+    If a run without calibration has enough scenes, further rows show what a calibration would give. Each half of the scenes is calibrated on the other half. If
+    halves are too small, each scene is calibrated on the others. Intervals follow the profiles of the scenes, or all have one width.
     """
     lines = [table_row([*HEAD]), "|" + "---|" * len(HEAD)]
     for kind, own in answers.items():
-        for name, pairs in pairs_of(own).items():
-            known = [
+        for name, known in known_of(own).items():
+            found = [
                 (answer, value)
                 for answer in own
                 for value in answer.values
                 if value.name.partition("#")[0] == name and value.truth is not None
             ]
-            values, level, is_calibrated = [value for _, value in known], known[0][0].level, known[0][0].num_calibration > 0
-            change = math.log if values[0].is_log else float
-            given = np.array([[change(end) for end in (v.estimate, v.low, v.high)] for v in values])
-            rows = {"earlier run" if is_calibrated else "none": given}
-            if not is_calibrated and len(values) > max(4, fewest_scenes(level)):
-                rows["other scenes"] = intervals_without_own(pairs, level)
-                rows["other scenes, one width"] = intervals_without_own(pairs, level, adapts=False)
-            seconds = f"{median(answer.processor_seconds for answer, _ in known):.1f}"
-            for calibration, found in rows.items():
-                lines.append(
-                    table_row([name, kind, calibration, str(len(values)), *_numbers(found, pairs.truth, values[0], level), seconds])
-                )
+            values, level, is_calibrated = [value for _, value in found], found[0][0].level, found[0][0].num_calibration > 0
+            rows = {"earlier run" if is_calibrated else "none": np.array([[v.coordinate(end) for end in (v.low, v.high)] for v in values])}
+            number, least = len(known), fewest_scenes(level)
+            if not is_calibrated and number > least:
+                half, others = (np.arange(number) % 2, "the other half") if number >= 2 * least else (np.arange(number), "other scenes")
+                rows[others] = cross_calibrated(known, half, level)
+                rows[f"{others}, one width"] = cross_calibrated(known, half, level, adapts=False)
+            errors = _errors(values)
+            seconds = f"{median(answer.processor_seconds for answer, _ in found):.1f}"
+            for calibration, ends in rows.items():
+                low, high = ends.T
+                truth = np.array([own.truth for own in known])
+                score = f"{interval_score(low, high, truth, level).mean():.3g}" + (" (logarithm)" if values[0].is_log else "")
+                cells = [name, kind, calibration, str(number), *errors, f"{coverage(low, high, truth):.0%} of {level:.0%}", score, seconds]
+                lines.append(table_row(cells))
     return lines if len(lines) > 2 else ["no scene has a stored value to compare with"]
 
 
-def _numbers(found: np.ndarray, truth: np.ndarray, value: Value, level: float) -> list[str]:
-    """Return errors, coverage and interval score of answers and interval ends [scene, 3] in coordinates, as cells of the table."""
-    estimate, low, high = found.T
-    plain = np.exp if value.is_log else np.asarray
-    error = plain(estimate) - plain(truth)
-    relative = f"{np.median(np.abs(error / plain(truth))):.1%}" if (plain(truth) != 0).all() else ""
-    score = f"{interval_score(low, high, truth, level).mean():.3g}" + (" (logarithm)" if value.is_log else "")
-    return [f"{np.median(np.abs(error)):.3g}", relative, f"{error.mean():.3g}", f"{coverage(low, high, truth):.0%} of {level:.0%}", score]
+def _errors(values: Sequence[Value]) -> list[str]:
+    """Return how many answers lie at a bound, and their errors, as cells of the table."""
+    estimate, truth = (np.array([getattr(value, name) for value in values]) for name in ("estimate", "truth"))
+    error = estimate - truth
+    relative = f"{np.median(np.abs(error / truth)):.1%}" if (truth != 0).all() else ""
+    num_at_bound = sum(bool(value.at_bound) for value in values)
+    return [str(num_at_bound), f"{np.median(np.abs(error)):.3g}", relative, f"{error.mean():.3g}"]

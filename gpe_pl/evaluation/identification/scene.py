@@ -12,9 +12,9 @@ from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.identification.answer import MODEL, SOLVER, Answer, value_of
 from gpe_pl.evaluation.identification.calibration import Calibration
 from gpe_pl.evaluation.identification.observations import Observations
+from gpe_pl.evaluation.identification.profile import Profile
 from gpe_pl.evaluation.identification.search import Found, SearchSettings, search
 from gpe_pl.evaluation.identification.shooting import Shooting, ShootingSettings, shooting
-from gpe_pl.evaluation.identification.spread import spread
 from gpe_pl.evaluation.identification.unknowns import Bounds, unknowns_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import Simulator
@@ -60,7 +60,7 @@ def identify(
         bounds: lowest and highest value by ``MATERIAL.PARAMETER``; by default the model's range in training. Solvers need bounds.
         shooting_settings: windows of the rollouts.
         search_settings: how to search.
-        calibration: corrections and intervals by name of the unknown (``calibration.calibrated``). Without it, intervals are rough.
+        calibration: widths of intervals by name of the unknown (``calibration.calibrated``). Without it, intervals are rough.
         scene: name of the scene, for the answer.
         on_progress: called with numbers of done and planned evaluations.
 
@@ -80,14 +80,15 @@ def _answer(scene: str, rollouts: Shooting, found: Found, calibration: Mapping[s
     """Return the answer of a search, without its times."""
     sought = rollouts.unknowns.items
     chosen = [calibration.get(unknown.name.partition("#")[0], Calibration()) for unknown in sought]
-    scales = spread(rollouts, found.z)
+    values = []
+    for k, (unknown, own) in enumerate(zip(sought, chosen, strict=True)):
+        tried = ((unknown.coordinate(float(unknown.at(float(z[k])))), misfit) for z, misfit in found.tried)
+        profile = Profile.of(tried, (unknown.coordinate(unknown.low), unknown.coordinate(unknown.high)))
+        values.append(value_of(unknown, float(found.z[k]), profile, own))
     return Answer(
         scene=scene,
         simulator=MODEL if isinstance(rollouts.simulator, LearnedSimulator) else SOLVER,
-        values=tuple(
-            value_of(u, float(u.at(z)), float(z), float(scale) * u.range, own)
-            for u, z, scale, own in zip(sought, found.z, scales, chosen, strict=True)
-        ),
+        values=tuple(values),
         level=chosen[0].level,
         num_calibration=min(own.num_scenes for own in chosen),
         method=found.method,

@@ -12,16 +12,18 @@ import pytest
 import torch
 
 from gpe_pl.evaluation import rollout_scores as rollout_scores_module
-from gpe_pl.evaluation.identification.answer import Answer, pairs_of, read_answers, side_by_side
-from gpe_pl.evaluation.identification.calibration import FewScenesError, Pairs, calibrated
+from gpe_pl.evaluation.identification.answer import Answer, AnswerError, known_of, read_answers, side_by_side
+from gpe_pl.evaluation.identification.calibration import FewScenesError, Known, calibrated, cross_calibrated
 from gpe_pl.evaluation.identification.gradient_check import GradientCheck, gradient_check
 from gpe_pl.evaluation.identification.observations import ObservationError, Observations, ObservationSettings
+from gpe_pl.evaluation.identification.profile import Profile
 from gpe_pl.evaluation.identification.results import Task, write_table
 from gpe_pl.evaluation.identification.scene import SolverError, identify, solver_of
 from gpe_pl.evaluation.identification.search import SearchSettings
 from gpe_pl.evaluation.identification.shooting import Shooting, ShootingError, ShootingSettings, shooting
 from gpe_pl.evaluation.identification.unknowns import UnknownError, unknowns_of
 from gpe_pl.evaluation.rollout_scores import rollout_scores
+from gpe_pl.files import sealed
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.conformal import interval_score
 from gpe_pl.models.gpe import GPE
@@ -67,7 +69,7 @@ def test_a_parameter_is_found_whatever_is_stored() -> None:
     seen = thrown()
     hidden = replace(seen, material_params=np.full_like(seen.material_params, 25.0))
     answer = identify(Drag(), hidden, bounds=BOUNDS)
-    assert answer["sand.friction_angle"].raw == pytest.approx(ANGLE, abs=0.1)
+    assert answer["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=0.1)
     assert answer["sand.friction_angle"].truth == 25.0
     assert answer.num_windows == 2
     assert answer.method == "derivative_free"
@@ -77,13 +79,13 @@ def test_a_parameter_is_found_whatever_is_stored() -> None:
 def test_logarithmic_parameters_are_found() -> None:
     simulator = Drag(rate=20.0)
     answer = identify(simulator, thrown(0.03, "fluid", simulator), bounds=BOUNDS)
-    assert answer.values[0].raw == pytest.approx(0.03, rel=0.02)
+    assert answer.values[0].estimate == pytest.approx(0.03, rel=0.02)
 
 
 def test_bodies_have_values_of_their_own() -> None:
     values = np.repeat([24.0, 38.0], 9)
     answer = identify(Drag(), thrown(values), per_body=True, bounds=BOUNDS, search_settings=SearchSettings(max_evaluations=100))
-    assert [value.raw for value in answer.values] == pytest.approx([24.0, 38.0], abs=0.5)
+    assert [value.estimate for value in answer.values] == pytest.approx([24.0, 38.0], abs=0.5)
     assert [value.truth for value in answer.values] == [24.0, 38.0]
 
 
@@ -96,19 +98,19 @@ def test_motion_of_the_scene_is_found_too(wanted: list[str]) -> None:
         tilted = replace(seen.metadata, gravity=tuple(9.81 * down / np.linalg.norm(down)))
         moved = rollout(Drag(), replace(seen.state(0), gravity=np.array(tilted.gravity)), 39, seen.metadata)
         answer = identify(Drag(), moved, wanted, bounds=BOUNDS, search_settings=settings)
-        assert answer["gravity.x"].raw == pytest.approx(10.0, abs=1.0)
+        assert answer["gravity.x"].estimate == pytest.approx(10.0, abs=1.0)
     else:
         answer = identify(Drag(), seen, wanted, bounds=BOUNDS, search_settings=settings)
-        assert [answer[f"velocity.{axis}"].raw for axis in "xy"] == pytest.approx([1.0, 0.5], abs=0.05)
+        assert [answer[f"velocity.{axis}"].estimate for axis in "xy"] == pytest.approx([1.0, 0.5], abs=0.05)
         assert answer.num_windows == 1
-    assert answer["sand.friction_angle"].raw == pytest.approx(ANGLE, abs=2.0)
+    assert answer["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=2.0)
 
 
 @pytest.mark.parametrize("settings", [{"nodes": 0.3}, {"every": 3}, {"added_noise": 3e-4}])
 def test_parts_of_the_motion_are_enough(settings: dict[str, float]) -> None:
     observed = Observations.of(thrown(), ObservationSettings(**settings))  # type: ignore[arg-type]
     answer = identify(Drag(), observed, bounds=BOUNDS)
-    assert answer["sand.friction_angle"].raw == pytest.approx(ANGLE, abs=3.0)
+    assert answer["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=3.0)
     assert (answer.num_windows == 1) == ("nodes" in settings)
 
 
@@ -134,7 +136,7 @@ def test_rollouts_that_fail_do_not_win() -> None:
                 raise SimulationError("too soft")
             return super().step(state)
 
-    assert identify(Fails(), thrown(32.0), bounds=BOUNDS).values[0].raw == pytest.approx(32.0, abs=0.2)
+    assert identify(Fails(), thrown(32.0), bounds=BOUNDS).values[0].estimate == pytest.approx(32.0, abs=0.2)
 
 
 def test_refusals() -> None:
@@ -278,41 +280,78 @@ def test_a_search_without_trusted_gradients_goes_on_without(monkeypatch: pytest.
 # --- calibration ---------------------------------------------------------------------------------------------------------------------------
 
 
-def biased(number: int, seed: int) -> Pairs:
-    """Return answers that are too low, with errors that follow their scale."""
+def scene(truth: float, certainty: float, error: float) -> Known:
+    """Return an answer whose misfit is a parabola."""
+    at = np.linspace(0, 60, 241)
+    return Known(truth + error, truth, Profile.of(zip(at, certainty * (at - truth - error) ** 2, strict=True), (0.0, 60.0)))
+
+
+def uneven(number: int, seed: int) -> list[Known]:
+    """Return scenes that say much about the unknown, and others that say little."""
     rng = np.random.default_rng(seed)
-    truth, scale = rng.uniform(20, 40, number), rng.choice([0.2, 2.0], number)
-    return Pairs(0.8 * truth - 3 + scale * rng.normal(size=number), truth, scale)
+    spread = rng.choice([0.2, 2.0], number)
+    return [scene(*own) for own in zip(rng.uniform(20, 40, number), spread**-2, spread * rng.normal(size=number), strict=True)]
 
 
-def test_a_small_scale_does_not_make_an_interval_narrow() -> None:
-    """A large one makes it wide."""
-    rng = np.random.default_rng(0)
-    truth = rng.normal(size=40)
-    found = calibrated(Pairs(truth + 0.1 * rng.normal(size=40), truth, np.ones(40)))
-    small, median, large = (high - low for _, low, high in (found.interval(0.0, scale) for scale in (0.0, 1.0, 20.0)))
-    assert 0.9 * median < small < median < 0.2 * large
+def test_a_profile_is_the_lower_hull_of_all_misfits() -> None:
+    tried = [(3.0, 1.0), (1.0, -1.0), (2.0, -2.0), (2.0, 5.0), (4.0, 8.0), (2.5, 3.0)]
+    found = Profile.of(tried, (0.0, 4.0))
+    assert found.at.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert found.excess.tolist() == [2.0, 1.0, 0.0, 3.0, 10.0]  # beyond 1 the first piece goes on
+    assert found.within(1.5) == pytest.approx((0.5, 2.5))
+    assert found.within(math.inf) == (0.0, 4.0)
+    assert found.above(1.5) == 0.5
+    assert found.above(4.1) == math.inf
 
 
-def test_calibration_corrects_and_covers() -> None:
-    known, new = calibrated(biased(200, 0)), biased(1000, 1)
-    center, low, high = np.array([known.interval(e, s) for e, s in zip(new.estimate, new.scale, strict=True)]).T
-    assert np.abs(np.mean(center - new.truth)) < 0.3
-    assert 0.84 < np.mean((low <= new.truth) & (new.truth <= high)) < 0.96
-    constant = calibrated(biased(200, 0), adapts=False)
-    _, lowest, highest = np.array([constant.interval(e, 1.0) for e in new.estimate]).T
-    assert interval_score(low, high, new.truth, 0.9).mean() < interval_score(lowest, highest, new.truth, 0.9).mean()
+def test_a_profile_without_values_near_a_bound_reaches_it() -> None:
+    found = Profile.of([(2.0, 1.0), (3.0, 4.0)], (0.0, 3.5))
+    assert found.within(0.1)[0] == 0.0
+    assert found.above(3.5) == 4.5
+    assert Profile.of([(2.0, 1.0)], (0.0, 3.0)).within(0.1) == (0.0, 3.0)
+
+
+def test_calibrated_intervals_cover_and_follow_the_misfit() -> None:
+    known, new = uneven(400, 0), uneven(1000, 1)
+    threshold = calibrated(known).threshold
+    truth = np.array([own.truth for own in new])
+    low, high = np.array([own.profile.within(threshold) for own in new]).T
+    assert 0.86 < np.mean((low <= truth) & (truth <= high)) < 0.94
+    halves = np.arange(400) % 2
+    scores = [
+        interval_score(*cross_calibrated(known, halves, 0.9, adapts).T, [k.truth for k in known], 0.9).mean() for adapts in (True, False)
+    ]
+    assert scores[0] < 0.8 * scores[1]
     with pytest.raises(FewScenesError, match="8 calibration scenes; .* at least 9"):
-        calibrated(biased(8, 0))
+        calibrated(uneven(8, 0))
+
+
+def test_intervals_do_not_depend_on_the_truth_of_their_own_part() -> None:
+    known = uneven(40, 0)
+    changed = [replace(own, truth=own.truth + 5) if k % 2 else own for k, own in enumerate(known)]
+    before, after = (cross_calibrated(own, np.arange(40) % 2) for own in (known, changed))
+    assert (before[1::2] == after[1::2]).all()
+    assert (before[::2] != after[::2]).any()
 
 
 def test_answers_are_read_as_they_were_written(tmp_path: Path) -> None:
     answer: Answer = identify(Drag(), thrown(), bounds=BOUNDS, scene="first")
     answer.write(tmp_path)
     assert read_answers(tmp_path, "solver") == [answer]
-    pairs = pairs_of([answer, answer])["sand.friction_angle"]
-    assert pairs.truth.tolist() == [ANGLE, ANGLE]
-    assert pairs.estimate[0] == answer.values[0].raw
+    known = known_of([answer, answer])["sand.friction_angle"]
+    assert [own.truth for own in known] == [ANGLE, ANGLE]
+    assert known[0].estimate == answer.values[0].estimate
+    assert known[0].profile.within(0.2) == pytest.approx((answer.values[0].low, answer.values[0].high))
+
+
+def test_an_answer_of_another_version_is_refused(tmp_path: Path) -> None:
+    identify(Drag(), thrown(), bounds=BOUNDS, scene="first").write(tmp_path)
+    path = tmp_path / "scenes" / "first_solver.json"
+    found = sealed.read(path, "")
+    found["values"][0]["scale"] = 1.0
+    sealed.write(path, found)
+    with pytest.raises(AnswerError, match=r"first_solver\.json: is an answer of another version; delete the file"):
+        read_answers(tmp_path, "solver")
 
 
 def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -333,12 +372,13 @@ def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.Monke
     assert "sand.friction_angle | model | none | 1 |" in write_table(tmp_path)
 
 
-def test_the_table_says_what_calibration_gives(tmp_path: Path) -> None:
-    for k, angle in enumerate(np.linspace(24, 38, 11)):
-        answer = identify(Drag(rate=0.11), thrown(angle), bounds=BOUNDS, scene=f"{k:02d}")  # all answers are too low by a tenth
-        answer.write(tmp_path)
+@pytest.mark.parametrize(("number", "others"), [(11, "other scenes"), (18, "the other half")])
+def test_the_table_says_what_calibration_gives(tmp_path: Path, number: int, others: str) -> None:
+    answer = identify(Drag(rate=0.11), thrown(31.0), bounds=BOUNDS)  # too low by a tenth
+    for k in range(number):
+        replace(answer, scene=f"{k:02d}").write(tmp_path)
     rows = [line.strip("| ").split(" | ") for line in write_table(tmp_path).splitlines()[2:]]
-    assert [row[2] for row in rows] == ["none", "other scenes", "other scenes, one width"]
-    errors = [float(row[4]) for row in rows]
-    assert errors[0] > 2 > 0.2 > max(errors[1:])
-    assert len((tmp_path / "table.md").read_text().splitlines()) == 5 + 1 + 2 + 11
+    assert [row[2] for row in rows] == ["none", others, f"{others}, one width"]
+    assert [row[8] for row in rows] == ["0% of 90%", "100% of 90%", "100% of 90%"]
+    assert all(float(row[5]) == pytest.approx(2.8, abs=0.1) for row in rows)
+    assert len((tmp_path / "table.md").read_text().splitlines()) == 5 + 1 + 2 + number
