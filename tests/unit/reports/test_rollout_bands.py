@@ -47,3 +47,11 @@ def test_horizons_are_in_order_of_time(script: dict[str, Any], tmp_path: Path) -
     evaluations(tmp_path)
     rows = script["rows_of"](tmp_path, "snow")
     assert script["values"](rows, "fraction_in_bands", "interpolated") == {"0.1s": [0.8] * 3, "full": [0.8] * 3}
+
+
+def test_rows_of_other_models_are_kept(script: dict[str, Any], tmp_path: Path) -> None:
+    table = tmp_path / "table.md"
+    table.write_text("| model | horizon |\n|---|---|\n| snow | 0.1s |\n| sand | 0.1s |\n| snow | full |\n")
+    script["kept_cells"].__globals__["EMBEDDED"] = table
+    assert script["kept_cells"](["sand"]) == [["snow", "0.1s"], ["snow", "full"]]
+    assert script["kept_cells"](["snow", "sand"]) == []
