@@ -48,7 +48,7 @@ PICTURES = (
     "active.png",
     "channel.png",
     *("acceptance_fem_beam.png", "acceptance_elastomer_square.png", "acceptance_sand_column.png"),
-    "scenes/*_00_misfit.png",
+    "scenes/*_00000_misfit.png",
     *("acceptance_snow_cylinder.png", "acceptance_fluid_dam_break.png", "acceptance_sand_slump.png"),
 )
 FILM = "rollout_test_00.gif"

@@ -137,8 +137,20 @@ def write_table(folder: Path) -> str:
     return "\n".join(summary)
 
 
+INTERIOR = 0.1
+"""True values that are at least this fraction of the range away from the bounds are in the interior."""
 HEAD = (
-    *("unknown", "simulator", "calibration", "scenes", "at a bound", "median error", "median relative error", "mean error"),
+    *(
+        "unknown",
+        "simulator",
+        "calibration",
+        "scenes",
+        "at a bound",
+        "median error",
+        "in the interior",
+        "median relative error",
+        "mean error",
+    ),
     *("coverage", "interval score", "processor seconds"),
 )
 
@@ -182,4 +194,13 @@ def _errors(values: Sequence[Value]) -> list[str]:
     error = estimate - truth
     relative = f"{np.median(np.abs(error / truth)):.1%}" if (truth != 0).all() else ""
     num_at_bound = sum(bool(value.at_bound) for value in values)
-    return [str(num_at_bound), f"{np.median(np.abs(error)):.3g}", relative, f"{error.mean():.3g}"]
+    inside = np.abs(error[[*map(_is_inside, values)]])
+    interior = f"{np.median(inside):.3g}" if len(inside) else ""
+    return [str(num_at_bound), f"{np.median(np.abs(error)):.3g}", interior, relative, f"{error.mean():.3g}"]
+
+
+def _is_inside(value: Value) -> bool:
+    """Return whether the true value, which has to be known, lies in the interior of the range between the bounds."""
+    assert value.truth is not None
+    (low, high), at = map(value.coordinate, value.bounds), value.coordinate(value.truth)
+    return low + INTERIOR * (high - low) <= at <= high - INTERIOR * (high - low)

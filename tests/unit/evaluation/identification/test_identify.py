@@ -385,6 +385,6 @@ def test_the_table_says_what_calibration_gives(tmp_path: Path, number: int, othe
         replace(answer, scene=f"{k:02d}").write(tmp_path)
     rows = [line.strip("| ").split(" | ") for line in write_table(tmp_path).splitlines()[2:]]
     assert [row[2] for row in rows] == ["none", others, f"{others}, one width"]
-    assert [row[8] for row in rows] == ["0% of 90%", "100% of 90%", "100% of 90%"]
-    assert all(float(row[5]) == pytest.approx(2.8, abs=0.1) for row in rows)
+    assert [row[9] for row in rows] == ["0% of 90%", "100% of 90%", "100% of 90%"]
+    assert all(float(row[5]) == float(row[6]) == pytest.approx(2.8, abs=0.1) for row in rows)
     assert len((tmp_path / "table.md").read_text().splitlines()) == 5 + 1 + 2 + number
