@@ -22,6 +22,15 @@ Card = tuple[str, dict[str, str], list[list[str]]]
 """Keyword, parameters in upper case, and data lines of a card."""
 
 LOADS = ("PRESSURE", "DFLUX")
+UNSEEN = {
+    **dict.fromkeys(
+        ("EQUATION", "MPC", "TIE", "COUPLING", "KINEMATIC", "DISTRIBUTING", "DISTRIBUTINGCOUPLING", "RIGIDBODY"), "couples nodes"
+    ),
+    **dict.fromkeys(("CYCLICSYMMETRYMODEL", "CONTACTPAIR", "CONTACT", "GAP"), "couples nodes"),
+    **dict.fromkeys(("SPRING", "DASHPOT", "MASS"), "adds forces or masses to nodes"),
+    **dict.fromkeys(("INITIALCONDITIONS", "TEMPERATURE"), "moves or strains bodies without a force"),
+}
+"""Cards that change the motion by what a trajectory cannot hold, and how."""
 HOLDING = {"ENCASTRE": (1, 3), "PINNED": (1, 3), "XSYMM": (1, 1), "YSYMM": (2, 2), "ZSYMM": (3, 3)}
 """Named boundary conditions, as the first and last held axis."""
 
@@ -85,7 +94,8 @@ def read(path: Path) -> Deck:
     """Read a deck.
 
     Raises:
-        Refusal: the file is missing or no deck; it has several steps, includes other files, or has distributed loads besides gravity and pressures.
+        Refusal: the file is missing or no deck; it has several steps, includes other files, has distributed loads besides gravity and pressures, or has
+            cards of ``UNSEEN``.
     """
     try:
         text = path.read_text(encoding="ascii", errors="replace")
@@ -125,6 +135,8 @@ def read(path: Path) -> Deck:
                     deck.pressures.append((_amplitude(parameters, amplitudes), loaded))
             elif keyword in LOADS:
                 raise Refusal(f"{path.name}: *{keyword} is not read; give forces as *CLOAD and pressures as *DLOAD or *DSLOAD")
+            elif (squeezed := keyword.replace(" ", "")) in UNSEEN:
+                raise Refusal(f"{path.name}: *{keyword} {UNSEEN[squeezed]}, which a model would not see; compute the deck without it")
             elif keyword == "TRANSFORM":
                 raise Refusal(f"{path.name}: *TRANSFORM; give held axes and forces along the global axes")
             elif keyword == "INCLUDE":

@@ -173,6 +173,17 @@ def test_nodes_can_be_held_along_some_axes(tmp_path: Path) -> None:
             str,
             r"\*DFLUX is not read; .* pressures as \*DLOAD",
         ),
+        (
+            lambda d: d.replace("*STEP", "*EQUATION\n2\n1, 1, 1., 2, 1, -1.\n*STEP"),
+            str,
+            r"\*EQUATION couples nodes, .* compute the deck without it",
+        ),
+        (lambda d: d.replace("*STEP", "*Contact Pair, INTERACTION=A\nLOW, HIGH\n*STEP"), str, r"\*CONTACT PAIR couples nodes"),
+        (
+            lambda d: d.replace("*STEP", "*INITIAL CONDITIONS, TYPE=VELOCITY\nTIP, 3, 1.\n*STEP"),
+            str,
+            r"\*INITIAL CONDITIONS moves or strains bodies",
+        ),
         (lambda d: d.replace("*STEP", "*TRANSFORM, NSET=TIP\n1., 0., 0., 0., 1., 0.\n*STEP"), str, r"\*TRANSFORM; give held axes"),
         (lambda d: d + "*STEP\n*END STEP\n", str, "has 2 steps, must have one"),
         (lambda d: d.replace("TIP, 2, -4.", "TOP, 2, -4."), str, r"\*CLOAD cannot be read \(unknown set of nodes 'TOP'\)"),
