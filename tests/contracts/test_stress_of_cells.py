@@ -26,7 +26,7 @@ def simulator(kind: str, **settings: Any) -> tuple[LearnedSimulator, State]:
     dim = 3 if kind == "tetrahedra" else 2
     build = scenes.builder((SOLID,), dim, mesh=True, cells=True)
     torch.manual_seed(0)
-    model = GPE(
+    model: Any = GPE(
         build.spec,
         hidden_channels=8,
         num_message_passing_steps=1,
@@ -44,14 +44,16 @@ def simulator(kind: str, **settings: Any) -> tuple[LearnedSimulator, State]:
         with torch.no_grad():
             model.deviator.constants[SOLID].logarithm["bias"].copy_(torch.tensor([10.0, SHEAR / unit, 1.0]).log() / 5.0)
     state = scenes.mesh_state(kind, (SOLID,), num_bodies=1, walls=False).to_torch()
+    assert state.rest_pos is not None
     centre = state.pos.mean(dim=0)
     skew = torch.eye(dim, dtype=torch.float64) + 0.1 * torch.randn(dim, dim, dtype=torch.float64)  # no cell is inverted
     return made, replace(state, pos=(state.rest_pos - state.rest_pos.mean(dim=0)) @ skew + centre, vel=0.01 * state.vel)
 
 
 def without_network(made: LearnedSimulator) -> LearnedSimulator:
+    model: Any = made.model
     with torch.no_grad():
-        for p in made.model.stress_decoder.parameters():  # type: ignore[union-attr]
+        for p in model.stress_decoder.parameters():
             p.zero_()
     return made
 
@@ -113,13 +115,14 @@ def test_the_modulus_learns_and_positions_do_not() -> None:
     without_network(made)
     made.train()
     made(made.builder(state)).stress[SOLID].square().mean().backward()
-    slope = made.model.deviator.constants[SOLID].logarithm["bias"].grad  # type: ignore[union-attr]
+    model: Any = made.model
+    slope = model.deviator.constants[SOLID].logarithm["bias"].grad
     assert slope is not None and slope[1] > 0 and slope[0].abs() < 1e-6 * slope[1]
-    assert not any(p.grad is not None and p.grad.any() for p in made.model.node_decoder.parameters())  # type: ignore[union-attr]
+    assert not any(p.grad is not None and p.grad.any() for p in model.node_decoder.parameters())
 
 
 def test_what_it_needs_is_named() -> None:
     build = scenes.builder((SOLID,), mesh=True, cells=True)
-    for wrong in ({"stress": False}, {"stress": True, "elastic": True}):
+    for stress, elastic in ((False, False), (True, True)):
         with pytest.raises(CellError, match="model.deviator=cells needs model.stress=true model.elastic=false graph.cells=true"):
-            GPE(build.spec, deviator="cells", hidden_channels=8, num_message_passing_steps=1, **wrong)  # type: ignore[arg-type]
+            GPE(build.spec, deviator="cells", hidden_channels=8, num_message_passing_steps=1, stress=stress, elastic=elastic)
