@@ -31,9 +31,9 @@ class Value:
     Attributes:
         name, label, unit, is_log: as in ``Unknown``.
         bounds: bounds of the search.
-        estimate: value with the smallest misfit.
-        low, high: ends of its interval.
-        at_bound: ``lower`` or ``upper`` if the estimate lies at a bound, else empty.
+        raw: value with the smallest misfit.
+        estimate, low, high: corrected value and ends of its interval.
+        at_bound: ``lower`` or ``upper`` if ``raw`` lies at a bound, else empty.
         truth: stored value; None if it is unknown.
         text: estimate with unit, and interval, for readers.
     """
@@ -43,6 +43,7 @@ class Value:
     unit: str
     is_log: bool
     bounds: tuple[float, float]
+    raw: float
     estimate: float
     low: float
     high: float
@@ -140,15 +141,17 @@ def value_of(unknown: Unknown, z: float, profile: Profile, calibration: Calibrat
         unknown: the unknown.
         z: its value with the smallest misfit, as a number from 0 to 1.
         profile: misfits of other values.
-        calibration: width of the interval.
+        calibration: correction and interval.
     """
-    estimate = float(unknown.at(z))
-    low, high = map(unknown.value, profile.within(calibration.threshold))
+    raw = float(unknown.at(z))
+    estimate, low, high = map(unknown.value, calibration.interval(unknown.coordinate(raw), profile))
     text = f"{unknown.text(estimate)} ({100 * calibration.level:g} %: {low:.3g}–{high:.3g})"
     if unknown.unit == "Pa":
         text = f"{unknown.text(estimate)} ({100 * calibration.level:g} %: {unknown.text(low)}–{unknown.text(high)})"
     truth, bounds = unknown.truth if math.isfinite(unknown.truth) else None, (unknown.low, unknown.high)
-    return Value(unknown.name, unknown.label, unknown.unit, unknown.is_log, bounds, estimate, low, high, unknown.bound_of(z), truth, text)
+    return Value(
+        unknown.name, unknown.label, unknown.unit, unknown.is_log, bounds, raw, estimate, low, high, unknown.bound_of(z), truth, text
+    )
 
 
 def known_of(answers: Iterable[Answer]) -> dict[str, list[Known]]:
@@ -159,7 +162,7 @@ def known_of(answers: Iterable[Answer]) -> dict[str, list[Known]]:
             if value.truth is not None:
                 low, high = map(value.coordinate, value.bounds)
                 profile = Profile.of(((value.coordinate(row[k]), row[-1]) for row in answer.tried), (low, high))
-                known = Known(value.coordinate(value.estimate), value.coordinate(value.truth), profile)
+                known = Known(value.coordinate(value.raw), value.coordinate(value.truth), profile)
                 found.setdefault(value.name.partition("#")[0], []).append(known)
     return found
 

@@ -1,8 +1,11 @@
 """Calibration of intervals on scenes with known unknowns, so that they have a guaranteed coverage.
 
 An interval contains all values whose misfit is at most a threshold above the smallest one (``profile``), as in intervals from a likelihood ratio. Scenes whose
-motion says little about an unknown have a flat curve, and so a wide interval. The threshold is split conformal (``metrics.conformal``): the score of a
-calibration scene is the misfit of its true value, above the smallest.
+motion says little about an unknown have a flat curve, and so a wide interval. A model that answers too low for every scene is corrected by ``truth ≈ a + b ·
+answer``, a line fitted by least squares in the coordinate of the unknown. It moves the ends of intervals, too.
+
+The threshold is split conformal (``metrics.conformal``). The score of a calibration scene is the misfit above the smallest of the answer that would have been
+corrected to its true value. Its line is fitted without the scene, so no scene corrects its own answer.
 """
 
 from __future__ import annotations
@@ -36,17 +39,25 @@ class Known:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Width of the intervals of one unknown.
+    """Correction and intervals of one unknown.
 
     Attributes:
+        offset, slope: the corrected answer is ``offset + slope · answer``.
         threshold: largest misfit above the smallest within an interval.
         num_scenes: number of calibration scenes; 0 if there was no calibration.
         level: nominal coverage.
     """
 
+    offset: float = 0.0
+    slope: float = 1.0
     threshold: float = ROUGH
     num_scenes: int = 0
     level: float = 0.9
+
+    def interval(self, estimate: float, profile: Profile) -> tuple[float, float, float]:
+        """Return the corrected answer and the ends of its interval, in the coordinate."""
+        center, low, high = (self.offset + self.slope * end for end in (estimate, *profile.within(self.threshold)))
+        return center, low, high
 
 
 def calibrated(known: Sequence[Known], level: float = 0.9) -> Calibration:
@@ -60,13 +71,17 @@ def calibrated(known: Sequence[Known], level: float = 0.9) -> Calibration:
         raise FewScenesError(
             f"{len(known)} calibration scenes; intervals of {100 * level:g} % need at least {least}: identify more scenes with known values"
         )
-    return Calibration(conformal_factor([own.profile.above(own.truth) for own in known], level), len(known), level)
+    scores = []
+    for k, own in enumerate(known):
+        offset, slope = _line([*known[:k], *known[k + 1 :]])
+        scores.append(own.profile.above((own.truth - offset) / slope))
+    return Calibration(*_line(known), conformal_factor(scores, level), len(known), level)
 
 
 def cross_calibrated(
     known: Sequence[Known], parts: Int[np.ndarray, "scene"], level: float = 0.9, adapts: bool = True
-) -> Float64[np.ndarray, "scene 2"]:
-    """Return the ends of the interval of each scene, calibrated on all scenes that are not in its part.
+) -> Float64[np.ndarray, "scene 3"]:
+    """Return the corrected answer of each scene and the ends of its interval, calibrated on all scenes that are not in its part.
 
     Args:
         known: the scenes.
@@ -77,12 +92,30 @@ def cross_calibrated(
     Raises:
         FewScenesError: scenes are too few.
     """
-    ends = np.empty((len(known), 2))
+    found = np.empty((len(known), 3))
     for part in np.unique(parts):
         others = [own for own, number in zip(known, parts, strict=True) if number != part]
         calibration = calibrated(others, level)
-        width = conformal_factor([abs(own.truth - own.estimate) for own in others], level)
+        width = _width(others, level)
         for k in np.flatnonzero(parts == part).tolist():
-            center = known[k].estimate
-            ends[k] = known[k].profile.within(calibration.threshold) if adapts else (center - width, center + width)
-    return ends
+            center, *ends = calibration.interval(known[k].estimate, known[k].profile)
+            found[k] = (center, *ends) if adapts else (center, center - width, center + width)
+    return found
+
+
+def _width(known: Sequence[Known], level: float) -> float:
+    """Return the half-width of intervals of one width around corrected answers."""
+    scores = []
+    for k, own in enumerate(known):
+        offset, slope = _line([*known[:k], *known[k + 1 :]])
+        scores.append(abs(own.truth - offset - slope * own.estimate))
+    return conformal_factor(scores, level)
+
+
+def _line(known: Sequence[Known]) -> tuple[float, float]:
+    """Return offset and slope of the correction. There is none if the true values do not rise with the answers."""
+    estimate, truth = (np.array([getattr(own, name) for own in known]) for name in ("estimate", "truth"))
+    if np.ptp(estimate) == 0:
+        return float(np.mean(truth - estimate)), 1.0
+    slope, offset = np.polyfit(estimate, truth, 1)
+    return (float(offset), float(slope)) if slope > 0 else (0.0, 1.0)

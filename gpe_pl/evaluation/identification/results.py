@@ -104,9 +104,7 @@ class Task:
         number = min(SHOWN_FRAMES, trajectory.num_frames - 1 - first)
         shown: dict[str, Trajectory] = {}
         for kind, answer in answers.items():
-            z = np.array(
-                [(u.coordinate(v.estimate) - u.coordinate(u.low)) / u.range for u, v in zip(sought.items, answer.values, strict=True)]
-            )
+            z = np.array([(u.coordinate(v.raw) - u.coordinate(u.low)) / u.range for u, v in zip(sought.items, answer.values, strict=True)])
             simulator: Simulator = self.model if kind == MODEL else solver_of(trajectory.metadata)
             if kind == MODEL:
                 model = self.model.configured(clamps_parameters=False)
@@ -171,32 +169,33 @@ def _summary(answers: Mapping[str, list[Answer]]) -> list[str]:
                 if value.name.partition("#")[0] == name and value.truth is not None
             ]
             values, level, is_calibrated = [value for _, value in found], found[0][0].level, found[0][0].num_calibration > 0
-            rows = {"earlier run" if is_calibrated else "none": np.array([[v.coordinate(end) for end in (v.low, v.high)] for v in values])}
+            given = np.array([[v.coordinate(end) for end in (v.estimate, v.low, v.high)] for v in values])
+            rows = {"earlier run" if is_calibrated else "none": given}
             number, least = len(known), fewest_scenes(level)
             if not is_calibrated and number > least:
                 half, others = (np.arange(number) % 2, "the other half") if number >= 2 * least else (np.arange(number), "other scenes")
                 rows[others] = cross_calibrated(known, half, level)
                 rows[f"{others}, one width"] = cross_calibrated(known, half, level, adapts=False)
-            errors = _errors(values)
+            num_at_bound = str(sum(bool(value.at_bound) for value in values))
             seconds = f"{median(answer.processor_seconds for answer, _ in found):.1f}"
+            truth = np.array([own.truth for own in known])
             for calibration, ends in rows.items():
-                low, high = ends.T
-                truth = np.array([own.truth for own in known])
-                score = f"{interval_score(low, high, truth, level).mean():.3g}" + (" (logarithm)" if values[0].is_log else "")
-                cells = [name, kind, calibration, str(number), *errors, f"{coverage(low, high, truth):.0%} of {level:.0%}", score, seconds]
-                lines.append(table_row(cells))
+                numbers = _numbers(ends, truth, values, level)
+                lines.append(table_row([name, kind, calibration, str(number), num_at_bound, *numbers, seconds]))
     return lines if len(lines) > 2 else ["no scene has a stored value to compare with"]
 
 
-def _errors(values: Sequence[Value]) -> list[str]:
-    """Return how many answers lie at a bound, and their errors, as cells of the table."""
-    estimate, truth = (np.array([getattr(value, name) for value in values]) for name in ("estimate", "truth"))
-    error = estimate - truth
-    relative = f"{np.median(np.abs(error / truth)):.1%}" if (truth != 0).all() else ""
-    num_at_bound = sum(bool(value.at_bound) for value in values)
+def _numbers(found: np.ndarray, truth: np.ndarray, values: Sequence[Value], level: float) -> list[str]:
+    """Return errors, coverage and interval score of answers and interval ends [scene, 3] in coordinates, as cells of the table."""
+    estimate, low, high = found.T
+    plain = np.exp if values[0].is_log else np.asarray
+    error = plain(estimate) - plain(truth)
     inside = np.abs(error[[*map(_is_inside, values)]])
     interior = f"{np.median(inside):.3g}" if len(inside) else ""
-    return [str(num_at_bound), f"{np.median(np.abs(error)):.3g}", interior, relative, f"{error.mean():.3g}"]
+    relative = f"{np.median(np.abs(error / plain(truth))):.1%}" if (plain(truth) != 0).all() else ""
+    score = f"{interval_score(low, high, truth, level).mean():.3g}" + (" (logarithm)" if values[0].is_log else "")
+    cells = [f"{np.median(np.abs(error)):.3g}", interior, relative, f"{error.mean():.3g}"]
+    return [*cells, f"{coverage(low, high, truth):.0%} of {level:.0%}", score]
 
 
 def _is_inside(value: Value) -> bool:

@@ -60,7 +60,7 @@ def identify(
         bounds: lowest and highest value by ``MATERIAL.PARAMETER``; by default the model's range in training. Solvers need bounds.
         shooting_settings: windows of the rollouts.
         search_settings: how to search.
-        calibration: widths of intervals by name of the unknown (``calibration.calibrated``). Without it, intervals are rough.
+        calibration: corrections and intervals by name of the unknown (``calibration.calibrated``). Without it, intervals are rough.
         scene: name of the scene, for the answer.
         on_progress: called with numbers of done and planned evaluations.
 
