@@ -31,7 +31,7 @@ from gpe_pl.nn.island_momentum import IslandMomentum, conserve, grouped, joined,
 from gpe_pl.nn.momentum_conv import RAW, EdgeState, Implementation, Interaction, MomentumConv, orient
 from gpe_pl.nn.node_loads import loads_of, plus, without_held_bodies
 from gpe_pl.nn.stress_of_cells import DeviatorOfCells
-from gpe_pl.schema import CELL, MESH_MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
+from gpe_pl.schema import BOUNDARY, CELL, MESH_MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
 Decoder = Literal["node", "pair", "contact"]
 LevelWeights = Literal["shared", "separate"]
@@ -167,11 +167,10 @@ class GPE(Model):
             stay bounded in any rollout. ``none`` follows the paper.
         elastic: cells of meshes move their nodes through the whole frame by a constitutive law that the model learns (see ``nn.elastic_bodies``).
         wall_distance: with ``elastic``, initial value of the learned distance from walls at which nodes stop, in rest spacings.
-        only_contacts: with ``elastic`` and the ``contact`` decoder, the network adds forces between bodies, and between bodies and walls, and nothing within
-            bodies.
+        wall_layer: with ``elastic``, initial thickness of the learned elastic layer of walls in front of that, in rest spacings; 0 stands for no layer.
+        only_contacts: with ``elastic`` and the ``contact`` decoder, the network adds forces between bodies, and nothing within bodies or at walls.
         viscous: with ``elastic``, cells also have a viscous stress with a learned constant. Choose false for data of solids without damping.
-        deviator: with ``stress`` and without ``elastic``, ``cells`` adds the deviatoric stress of neo-Hookean cells to what the network decodes (see
-            ``nn.stress_of_cells``); ``network`` leaves all to the network.
+        deviator: with ``stress`` and without ``elastic``, ``cells`` adds the deviatoric stress of cells to the network's (see ``nn.stress_of_cells``).
         island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or
             ``ignored``.
 
@@ -198,6 +197,7 @@ class GPE(Model):
         island_momentum: IslandMomentum = "ignored",
         elastic: bool = False,
         wall_distance: Annotated[float, Field(ge=0)] = 0.0,
+        wall_layer: Annotated[float, Field(ge=0)] = 0.0,
         only_contacts: bool = False,
         viscous: bool = True,
         deviator: StressForm = "network",
@@ -217,6 +217,7 @@ class GPE(Model):
             island_momentum=island_momentum,
             elastic=elastic,
             wall_distance=wall_distance,
+            wall_layer=wall_layer,
             only_contacts=only_contacts,
             viscous=viscous,
             deviator=deviator,
@@ -286,10 +287,11 @@ class GPE(Model):
             forces = [r for r in spec.relations if r[1] in (RADIUS, CELL)]
             if self.bodies:
                 forces = [r for r in forces if r[1] == RADIUS and {r[0], r[2]} & {*self.bodies}]
+            forces = [r for r in forces if not (elastic and only_contacts and BOUNDARY in r)]  # the law has the walls
             self.pair_decoder = nn.ModuleDict({self.key(r): PairForce(spec, r, hidden) for r in forces})
         if elastic:
             self.elastic_bodies = ElasticBodies(
-                {m: spec.param_channels[m] if m in read else 0 for m in spec.meshes}, spec.dim, wall_distance, viscous
+                {m: spec.param_channels[m] if m in read else 0 for m in spec.meshes}, spec.dim, wall_distance, wall_layer, viscous
             )
             zeroed = [cast(MLP, self.node_decoder[m])[2] for m in spec.meshes] if decoder != "pair" else []
             zeroed += [cast(PairForce, force).lin_out for force in self.pair_decoder.values()] if decoder == "pair" or self.bodies else []

@@ -1,7 +1,7 @@
 """Elastic bodies of a graph: their cells and the walls beside them move the nodes through the whole frame (see ``nn.elastic_motion``).
 
-The network learns the constants of the cells as functions of the material parameters, a factor of the friction, and the distance at which walls act. What it
-predicts besides, such as contact between bodies, acts as a constant acceleration.
+The network learns the constants of the cells as functions of the material parameters, a factor of the friction, the distance at which walls stop nodes, and the
+elastic layer in front of them. What it predicts besides, such as contact between bodies, acts as a constant acceleration.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
@@ -21,6 +22,8 @@ from gpe_pl.system.compiled import is_wanted
 
 MAX_CACHED = 64
 """Largest number of graphs whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
+FIRST_DAMPING = 0.1
+"""Damping of the layer of walls before training, as a fraction of critical damping."""
 ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "cell_index", "corner_index", "corner")
 """Entries of a material's store that the law reads."""
 
@@ -43,6 +46,45 @@ class Moved(NamedTuple):
     stress: dict[str, Tensor]
 
 
+class WallLayer(nn.Module):
+    """Elastic layer of walls, of the material of the body that it touches: thickness, stiffness and damping are learned.
+
+    The material point method has such a layer. Its particles feel a wall as soon as they share a cell of the grid with it, and deform on their way to it.
+
+    Args:
+        thickness: thickness before training, in rest spacings; 0 stands for no layer, which is not learned.
+    """
+
+    def __init__(self, thickness: float) -> None:
+        super().__init__()
+        self.has_thickness = thickness > 0
+        if self.has_thickness:
+            self.log_thickness = nn.Parameter(torch.tensor(float(thickness)).log())
+            self.log_stiffness = nn.Parameter(torch.zeros(()))
+            self.log_damping = nn.Parameter(torch.tensor(FIRST_DAMPING).log())
+
+    def values(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the thickness in rest spacings, the stiffness as a factor of λ + 2μ, and the damping per square root of the stiffness."""
+        if not self.has_thickness:
+            nothing = torch.zeros(())
+            return nothing, nothing, nothing
+        return self.log_thickness.exp(), self.log_stiffness.exp(), 2.0 * self.log_damping.exp()
+
+    def of_nodes(self, modulus: Float[Tensor, " node"], mass: Float[Tensor, " node"], spacing: Tensor) -> Float[Tensor, "node 3"] | None:
+        """Return the layer of each node as ``elastic_motion.Walls`` has it; None without a layer.
+
+        Args:
+            modulus: λ + 2μ in units of mean mass × spacing^(2 - dim) per frame².
+            mass: masses in units of their mean.
+            spacing: rest spacing [m].
+        """
+        if not self.has_thickness:
+            return None
+        thickness, stiffness, damping = (value.to(modulus) for value in self.values())
+        per_mass = stiffness * modulus / (thickness * mass)
+        return torch.stack([(thickness * spacing).expand_as(per_mass), per_mass, damping * per_mass.sqrt()], dim=1)
+
+
 class ElasticBodies(nn.Module):
     """Moves the nodes of bodies by their cells.
 
@@ -51,7 +93,8 @@ class ElasticBodies(nn.Module):
     Args:
         param_channels: number of parameters per material with cells; 0 leaves the parameters out.
         dim: dimension of space.
-        wall_distance: distance at which walls act before training, in rest spacings.
+        wall_distance: distance at which walls stop nodes before training, in rest spacings.
+        wall_layer: thickness of the elastic layer of walls before training, in rest spacings; 0 stands for no layer.
         viscous: cells have a viscous stress, whose constant is learned; otherwise it is negligible.
     """
 
@@ -59,12 +102,15 @@ class ElasticBodies(nn.Module):
     spacing: Tensor
     stress_unit: Tensor
 
-    def __init__(self, param_channels: dict[str, int], dim: int, wall_distance: float = 0.0, viscous: bool = True) -> None:
+    def __init__(
+        self, param_channels: dict[str, int], dim: int, wall_distance: float = 0.0, wall_layer: float = 0.0, viscous: bool = True
+    ) -> None:
         super().__init__()
         self.dim = dim
         self.constants = nn.ModuleDict({m: Constants(count, viscous) for m, count in param_channels.items()})
         self.log_friction = nn.ParameterDict({m: torch.zeros(()) for m in param_channels})
         self.wall_distance = nn.ParameterDict({m: torch.tensor(float(wall_distance)) for m in param_channels})
+        self.wall_layer = nn.ModuleDict({m: WallLayer(wall_layer) for m in param_channels})
         self.register_buffer("acceleration_unit", torch.ones((), dtype=torch.float64))
         self.register_buffer("spacing", torch.ones((), dtype=torch.float64))
         self.register_buffer("stress_unit", torch.ones((), dtype=torch.float64))
@@ -128,9 +174,11 @@ class ElasticBodies(nn.Module):
         cells = cells_at_rest(m, store["cell_index"], store["rest_pos"], mass.to(device), scene)
         # masses are in units of their mean, and the rest volume of a node is about spacing^dim
         modulus = spacing ** (2 - self.dim)
-        lam, mu, eta = ((value.to(device) * modulus)[cells.nodes].mean(dim=1) for value in constants)
+        of_node = [value.to(device) for value in constants]
+        lam, mu, eta = ((value * modulus)[cells.nodes].mean(dim=1) for value in of_node)
         normal, gap, friction = store["wall"].split([self.dim, 1, 1], dim=1)
-        walls = Walls(normal, gap[:, 0] - self.wall_distance[m].to(device) * spacing, friction[:, 0] * friction_factor)
+        layer = cast(WallLayer, self.wall_layer[m]).of_nodes(of_node[0] + 2.0 * of_node[1], mass.to(device), spacing)
+        walls = Walls(normal, gap[:, 0] - self.wall_distance[m].to(device) * spacing, friction[:, 0] * friction_factor, layer)
         ends, corner = store["corner_index"], store["corner"]
         corners = Corners(ends, body_pos.double()[ends[:, 0]] + corner[:, : self.dim], corner[:, self.dim] * friction_factor.detach())
         way, at_end, law = elastic_motion(
@@ -151,6 +199,8 @@ class ElasticBodies(nn.Module):
         cells = cells_at_rest(m, host["cell_index"], host["rest_pos"], mass_on_host, scene)
         law = cast(Constants, self.constants[m]).logarithm
         units = [self.acceleration_unit, self.spacing, self.stress_unit, self.log_friction[m].exp(), self.wall_distance[m] * self.spacing]
+        thickness, *others = cast(WallLayer, self.wall_layer[m]).values()
+        units += [thickness * self.spacing, *others]
         moved, at_end = np.empty(acceleration.shape, _array(acceleration).dtype), np.empty(acceleration.shape)
         components = 4 if self.dim == 2 else 6
         stress = np.empty((len(mass) if with_stress else 0, components), moved.dtype)

@@ -37,14 +37,15 @@ def move_bodies(
         body_pos, velocity, wall, corner_index, corner: entries of the graph, see ``graphs.builder``.
         nodes, gradient, volume, rate: of cells, see ``elastic_motion.Cells``.
         cell_start, node_start: first cell and node of each scene, and their numbers [scene + 1].
-        units: units of accelerations, of length, and of stresses, factor of the friction, and distance in m at which walls act.
+        units: units of accelerations, of length, and of stresses, factor of the friction, distance in m at which walls stop nodes, and three values of the
+            layer in front of it, see ``elastic_bodies.WallLayer``.
         limits: largest number of substeps, and length of a substep as a fraction of the largest one that is stable.
         moved: accelerations without gravity that move the nodes as far [node, dim]; a result.
         at_end: velocities at the end of the frame [node, dim] in m/frame; a result.
         stress: Cauchy stress at the end of the frame [node, component], or without rows; a result.
     """
     num_nodes, dim = acceleration.shape
-    acceleration_unit, spacing, stress_unit, friction_factor, wall_distance = units
+    acceleration_unit, spacing, stress_unit, friction_factor, wall_distance, thickness, layer_stiffness, layer_damping = units
     pos, vel, forcing, weights = (
         np.empty((num_nodes, dim)),
         np.empty((num_nodes, dim)),
@@ -65,10 +66,17 @@ def move_bodies(
         point_friction[k] = corner[k, dim] * friction_factor
         for a in range(dim):
             point[k, a] = pos[corner_index[k, 0], a] + corner[k, a]
-    lam, mu, eta = _constants(params, weight, bias, scale, spacing ** (2 - dim), nodes)
+    of_node = _constants(params, weight, bias, scale)
+    lam, mu, eta = _of_cells(of_node, spacing ** (2 - dim), nodes)
     number = np.empty(len(node_start) - 1, np.int64)
     for s in range(len(number)):
         number[s] = _soften(pos, lam, mu, eta, nodes, gradient, rate, cell_start[s], cell_start[s + 1], limits[0], limits[1])
+    layer = np.zeros((num_nodes, 3))
+    for s in range(len(number) if thickness > 0.0 else 0):
+        for n in range(node_start[s], node_start[s + 1]):
+            stiffness = layer_stiffness * (of_node[n, 0] + 2.0 * of_node[n, 1]) * spacing / (thickness * mass[n])
+            layer[n, 0], layer[n, 1] = thickness, min(stiffness, float(number[s]) ** 2)
+            layer[n, 2] = min(layer_damping * math.sqrt(stiffness), 0.5 * number[s])
     pair_start, scene = np.zeros(len(node_start), np.int64), 0
     for k in range(len(corner)):
         while corner_index[k, 0] >= node_start[scene + 1]:
@@ -78,8 +86,8 @@ def move_bodies(
     path, speed_path, pushed = np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim))
     contacts = np.zeros((KEPT, len(corner), 6))
     move_forward(
-        pos, vel, forcing, weights, lam, mu, eta, normal, gap, friction, point, point_friction, corner_index, nodes, gradient, volume, cell_start,
-        node_start, pair_start, number, path, speed_path, pushed, contacts, at_end,
+        pos, vel, forcing, weights, lam, mu, eta, normal, gap, friction, layer, point, point_friction, corner_index, nodes, gradient, volume,
+        cell_start, node_start, pair_start, number, path, speed_path, pushed, contacts, at_end,
     )  # fmt: skip
     for s in range(len(number)):
         last = path[number[s] % KEPT]
@@ -94,20 +102,27 @@ def move_bodies(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _constants(params, weight, bias, scale, modulus, nodes):
-    """Return λ, μ and η of each cell, the means over its corners; see ``elastic_motion.Constants``."""
-    of_node, found = np.empty((len(params), 3)), np.zeros((3, len(nodes)))
+def _constants(params, weight, bias, scale):
+    """Return λ, μ and η of each node [node, 3]; see ``elastic_motion.Constants``."""
+    of_node = np.empty((len(params), 3))
     for n in range(len(params)):
         for k in range(3):
             logarithm = float(bias[k])
             for c in range(params.shape[1]):
                 logarithm += params[n, c] * weight[k, c]
-            of_node[n, k] = math.exp(min(max(scale * logarithm, -20.0), 20.0)) * modulus
-    corners = nodes.shape[1]
+            of_node[n, k] = math.exp(min(max(scale * logarithm, -20.0), 20.0))
+    return of_node
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _of_cells(of_node, modulus, nodes):
+    """Return λ, μ and η of each cell in the unit ``modulus``, the means over its corners."""
+    corners, found = nodes.shape[1], np.zeros((3, len(nodes)))
     for cell in range(len(nodes)):
         for k in range(3):
             for a in range(corners):
-                found[k, cell] += of_node[nodes[cell, a], k] / corners
+                found[k, cell] += of_node[nodes[cell, a], k] * modulus / corners
     return found[0], found[1], found[2]
 
 

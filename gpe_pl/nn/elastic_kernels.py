@@ -157,6 +157,16 @@ def _add_solid_forces(y, velocity, lam, mu, eta, nodes, gradient, volume, first_
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
+def _wall_contact(distance, along, layer, h):
+    """Return the change of a node's normal velocity by its wall, positive in contact, and whether the node stops on the plane of the wall."""
+    soft, stop = 0.0, -distance / h - along
+    if distance < layer[0]:
+        soft = h * (layer[1] * (layer[0] - distance) - layer[2] * along)
+    return (stop, True) if stop >= soft else (soft, False)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
 def _stop_at_corner(y, velocity, mass, p, mu, a, b, h, contact):
     """Change the velocities of the ends of an edge that a corner would pass; write normal, place, stop and the factors of the ends to ``contact``.
 
@@ -193,8 +203,8 @@ def _stop_at_corner(y, velocity, mass, p, mu, a, b, h, contact):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def move_forward(
-    pos, vel, forcing, mass, lam, mu, eta, normal, gap, friction, point, point_friction, pair, nodes, gradient, volume, cell_start, node_start,
-    pair_start, number, path, speed_path, pushed, contacts, last_vel,
+    pos, vel, forcing, mass, lam, mu, eta, normal, gap, friction, layer, point, point_friction, pair, nodes, gradient, volume, cell_start,
+    node_start, pair_start, number, path, speed_path, pushed, contacts, last_vel,
 ):  # fmt: skip
     """Integrate all scenes, each with its own number of substeps.
 
@@ -239,15 +249,16 @@ def move_forward(
                     along += value * normal[n, i]
                     distance += (y[n, i] - pos[n, i]) * normal[n, i]
                     has_wall |= normal[n, i] != 0.0
-                if has_wall and distance + h * along < 0.0:
-                    square, change = 0.0, -distance / h - along
+                change, is_stopped = _wall_contact(distance, along, layer[n], h)
+                if has_wall and change > 0.0:
+                    square, after = 0.0, -distance / h if is_stopped else along + change
                     for i in range(dim):
                         square += (pushed[now, n, i] - along * normal[n, i]) ** 2
                     left = 0.0
                     if square > (friction[n] * change) ** 2:
                         left = 1.0 - friction[n] * change / math.sqrt(square)
                     for i in range(dim):
-                        speed_path[ahead, n, i] = left * (pushed[now, n, i] - along * normal[n, i]) - distance / h * normal[n, i]
+                        speed_path[ahead, n, i] = left * (pushed[now, n, i] - along * normal[n, i]) + after * normal[n, i]
             for pq in range(pair_start[s], pair_start[s + 1]):
                 _stop_at_corner(y, speed_path[ahead], mass, point[pq], point_friction[pq], pair[pq, 0], pair[pq, 1], h, contacts[now, pq])
             for n in range(node_start[s], node_start[s + 1]):
@@ -370,13 +381,13 @@ def _pull_back_solid(
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def pull_back(
-    grad, grad_last, path, speed_path, pushed, contacts, mass, lam, mu, eta, normal, gap, friction, pair, nodes, gradient, volume, cell_start, node_start,
-    pair_start, number,
-    grad_pos, grad_vel, grad_forcing, grad_lam, grad_mu, grad_eta, grad_gap, grad_friction,
+    grad, grad_last, path, speed_path, pushed, contacts, mass, lam, mu, eta, normal, gap, friction, layer, pair, nodes, gradient, volume, cell_start,
+    node_start, pair_start, number,
+    grad_pos, grad_vel, grad_forcing, grad_lam, grad_mu, grad_eta, grad_gap, grad_friction, grad_layer,
 ):  # fmt: skip
     """Propagate the gradients of displacement (``grad``) and last velocity (``grad_last``) to the inputs, substep by substep, last first.
 
-    ``grad_pos`` to ``grad_friction`` are results. ``path``, ``speed_path``, ``pushed`` and ``contacts`` are results of ``move_forward``.
+    ``grad_pos`` to ``grad_layer`` are results. ``path``, ``speed_path``, ``pushed`` and ``contacts`` are results of ``move_forward``.
     """
     dim = path.shape[2]
     per_mass, to_pos, to_vel, to_start = np.empty_like(grad), np.empty_like(grad), np.empty_like(grad), np.zeros_like(grad)
@@ -412,22 +423,29 @@ def pull_back(
                         along += pushed[k, n, i] * normal[n, i]
                         distance += (path[k, n, i] - path[0, n, i]) * normal[n, i]
                         has_wall |= normal[n, i] != 0.0
-                    if has_wall and distance + h * along < 0.0:
-                        square, change, of_normal, of_tangential = 0.0, -distance / h - along, 0.0, 0.0
+                    change, is_stopped = _wall_contact(distance, along, layer[n], h)
+                    if has_wall and change > 0.0:
+                        square, of_normal, of_tangential = 0.0, 0.0, 0.0
                         for i in range(dim):
                             tangential = pushed[k, n, i] - along * normal[n, i]
                             square += tangential**2
                             of_normal += grad_vel[n, i] * normal[n, i]
                             of_tangential += grad_vel[n, i] * tangential
-                        of_distance, of_along, left, swept = -of_normal / h, 0.0, 0.0, 0.0
+                        of_change, left, swept = 0.0, 0.0, 0.0
                         if square > (friction[n] * change) ** 2:
                             root = math.sqrt(square)
                             left = 1.0 - friction[n] * change / root
                             of_change = -friction[n] * of_tangential / root
                             grad_friction[n] -= change * of_tangential / root
-                            of_distance -= of_change / h
-                            of_along = -of_change
                             swept = friction[n] * change / root * of_tangential / square
+                        if is_stopped:
+                            of_distance, of_along = -(of_normal + of_change) / h, -of_change
+                        else:
+                            of_soft = h * (of_normal + of_change)
+                            of_distance, of_along = -layer[n, 1] * of_soft, of_normal - layer[n, 2] * of_soft
+                            grad_layer[n, 0] += layer[n, 1] * of_soft
+                            grad_layer[n, 1] += (layer[n, 0] - distance) * of_soft
+                            grad_layer[n, 2] -= along * of_soft
                         for i in range(dim):
                             tangential = pushed[k, n, i] - along * normal[n, i]
                             own = grad_vel[n, i] - of_normal * normal[n, i]

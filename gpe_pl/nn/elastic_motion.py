@@ -10,8 +10,9 @@ stress, as in ``solvers.fem.elements`` (Bonet & Wood 2008, section 6.4.3)::
 
     P = μ F + (λ log J − μ)/J cof F + η F (Fᵀ Ḟ + Ḟᵀ F)
 
-A node that would enter the plane of its nearest wall loses just enough normal velocity to arrive on it. Coulomb friction takes tangential velocity. Forces of
-cells change neither the linear nor the angular momentum of a body.
+A node that would enter the plane of its nearest wall loses just enough normal velocity to arrive on it. Walls may have an elastic layer in front of this plane,
+as a spring and a damper on each node in it, which do not pull. Coulomb friction takes tangential velocity. Forces of cells change neither the linear nor the
+angular momentum of a body.
 
 Units: time is in frames, length in m, and masses in any unit. λ and μ are in that unit of mass per m^(dim − 2) and frame², and η is in that times a frame.
 """
@@ -140,11 +141,13 @@ class Walls:
         normal: outward normals [node, dim]; zero where no wall is near.
         gap: distances of the nodes from their planes [node] in m.
         friction: Coulomb coefficients [node].
+        layer: thickness of the elastic layer in m, its stiffness per mass in 1/frame², and its damping per mass in 1/frame [node, 3]; None stands for none.
     """
 
     normal: Float[Tensor, "node dim"]
     gap: Float[Tensor, " node"]
     friction: Float[Tensor, " node"]
+    layer: Float[Tensor, "node 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -207,8 +210,10 @@ def elastic_motion(
     if held is not None:
         forcing, axis_mass = torch.where(held, 0.0, forcing), torch.where(held, HEAVY, axis_mass)
     gap = walls.gap.clamp(min=0.0)  # a node behind a plane is not pushed out at once
+    layer = pos.new_zeros(len(pos), 3) if walls.layer is None else _stable_layer(walls.layer, number, cells)
     values = [
-        t.double() for t in (pos, vel, forcing, axis_mass, *softened, walls.normal, gap, walls.friction, corners.point, corners.friction)
+        t.double()
+        for t in (pos, vel, forcing, axis_mass, *softened, walls.normal, gap, walls.friction, layer, corners.point, corners.friction)
     ]
     move: Any = _Motion.apply if works_on(*values) else plain_motion
     displacement, velocity = move(*values, corners.nodes, cells, number)
@@ -233,6 +238,7 @@ def plain_motion(
     normal: Tensor,
     gap: Tensor,
     friction: Tensor,
+    layer: Tensor,
     point: Tensor,
     point_friction: Tensor,
     pair: Tensor,
@@ -254,24 +260,33 @@ def plain_motion(
         half = torch.where(torch.logical_or(own == k, torch.full_like(own, k == 0, dtype=torch.bool)), 0.5, 1.0)[:, None]
         pushed = velocity + half * step * total
         moves = (own > k)[:, None]
-        stopped = _stopped(pushed, y - pos, normal, gap, friction, step[:, 0])
+        stopped = _stopped(pushed, y - pos, normal, gap, friction, layer, step[:, 0])
         stopped = _stopped_by_corners(stopped, y, mass, corners, step[:, 0])
         velocity = torch.where(moves, stopped, torch.where((own == k)[:, None], pushed, velocity))
         y = torch.where(moves, y + step * velocity, y)
     return y - pos, velocity
 
 
-def _stopped(velocity: Tensor, moved: Tensor, normal: Tensor, gap: Tensor, friction: Tensor, step: Tensor) -> Tensor:
+def _stable_layer(layer: Float[Tensor, "node 3"], number: Int64[Tensor, " scene"], cells: Cells) -> Float[Tensor, "node 3"]:
+    """Return the layer of each node, softened where the substeps of its scene would be too long for it."""
+    rate = number.repeat_interleave(cells.node_start.diff(), output_size=len(layer)).to(layer)
+    thickness, stiffness, damping = layer.unbind(dim=1)
+    return torch.stack([thickness, torch.minimum(stiffness, rate.square()), torch.minimum(damping, 0.5 * rate)], dim=1)
+
+
+def _stopped(velocity: Tensor, moved: Tensor, normal: Tensor, gap: Tensor, friction: Tensor, layer: Tensor, step: Tensor) -> Tensor:
     """Return velocities after contact."""
     along = (velocity * normal).sum(dim=1)
     distance = gap + (moved * normal).sum(dim=1)
-    hits = (distance + step * along < 0) & (normal != 0).any(dim=1)
-    change = -distance / step - along
+    thickness, stiffness, damping = layer.unbind(dim=1)
+    soft = torch.where(distance < thickness, step * (stiffness * (thickness - distance) - damping * along), 0.0)
+    change = torch.maximum(-distance / step - along, soft)
+    hits = (change > 0) & (normal != 0).any(dim=1)
     tangential = velocity - along[:, None] * normal
     speed = tangential.square().sum(dim=1)
     slips = speed > (friction * change).square()
     left = torch.where(slips, 1.0 - friction * change / torch.where(slips, speed, 1.0).sqrt(), 0.0)
-    return torch.where(hits[:, None], (-distance / step)[:, None] * normal + left[:, None] * tangential, velocity)
+    return torch.where(hits[:, None], (along + change)[:, None] * normal + left[:, None] * tangential, velocity)
 
 
 def _in_rounds(pair: Int64[Tensor, "pair 2"], num_nodes: int) -> Iterator[Int64[np.ndarray, " _"]]:
@@ -428,12 +443,12 @@ class _Motion(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor, grad_last: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        pos, vel, forcing, mass, lam, mu, eta, normal, gap, friction, *_ = (t.numpy() for t in ctx.saved_tensors)
-        found = [np.zeros_like(a) for a in (pos, vel, forcing, lam, mu, eta, gap, friction)]
-        constants = (mass, lam, mu, eta, normal, gap, friction)
+        pos, vel, forcing, mass, lam, mu, eta, normal, gap, friction, layer, *_ = (t.numpy() for t in ctx.saved_tensors)
+        found = [np.zeros_like(a) for a in (pos, vel, forcing, lam, mu, eta, gap, friction, layer)]
+        constants = (mass, lam, mu, eta, normal, gap, friction, layer)
         pull_back(grad.contiguous().numpy(), grad_last.contiguous().numpy(), *ctx.paths, *constants, *ctx.geometry, *found)
-        pos, vel, forcing, lam, mu, eta, gap, friction = (torch.from_numpy(g) for g in found)
-        return pos, vel, forcing, None, lam, mu, eta, None, gap, friction, None, None, None, None, None
+        pos, vel, forcing, lam, mu, eta, gap, friction, layer = (torch.from_numpy(g) for g in found)
+        return pos, vel, forcing, None, lam, mu, eta, None, gap, friction, layer, None, None, None, None, None
 
 
 class Constants(nn.Module):

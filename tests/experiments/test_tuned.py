@@ -78,8 +78,8 @@ def test_a_law_sets_model_graph_and_training_together(data: str, model: str, law
     assert set(found.values()) == {is_elastic}, found
     assert is_elastic or cfg.training.push_fraction > 0
     of_grid = (data, model, law) == ("elastomer", "gpe_tuned", "elastic")
-    assert (cfg.training.loss, cfg.model.wall_distance, cfg.model.only_contacts) == (
-        ("log", 1.0, True) if of_grid else ("square", 0.0, False)
+    assert (cfg.training.loss, cfg.model.wall_layer, cfg.model.only_contacts, cfg.model.viscous) == (
+        ("log", 1.5, True, False) if of_grid else ("square", 0.0, False, True)
     )
 
 

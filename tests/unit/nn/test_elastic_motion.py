@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -94,7 +95,7 @@ def several(kind: str, count: int = 3) -> tuple[list[Body], dict[str, Any]]:
     bodies = [Body(kind, 2.0 * 8.0**k, 0.05, seed=k) for k in range(count)]
     random = torch.Generator().manual_seed(1)
     parts: dict[str, list[Tensor]] = {
-        name: [] for name in ("pos", "vel", "forcing", "mass", "normal", "gap", "friction", "lam", "mu", "eta")
+        name: [] for name in ("pos", "vel", "forcing", "mass", "normal", "gap", "friction", "layer", "lam", "mu", "eta")
     }
     rests, nodes, start = [], [], 0
     for k, body in enumerate(bodies):
@@ -108,6 +109,7 @@ def several(kind: str, count: int = 3) -> tuple[list[Body], dict[str, Any]]:
             "mass": torch.cat([body.mass, body.mass[:1]]), "normal": normal,
             "gap": 0.1 * SPACING * torch.rand(len(rest), generator=random, dtype=torch.float64),
             "friction": torch.rand(len(rest), generator=random, dtype=torch.float64),
+            "layer": torch.rand(len(rest), 3, generator=random, dtype=torch.float64) * torch.tensor([0.2 * SPACING, 20.0, 1.0]).double(),
             **{name: c * (1 + torch.rand(len(c), generator=random, dtype=torch.float64)) for name, c in zip(("lam", "mu", "eta"), body.law, strict=True)},
         }  # fmt: skip
         for name, value in values.items():
@@ -122,14 +124,14 @@ def several(kind: str, count: int = 3) -> tuple[list[Body], dict[str, Any]]:
 
 
 def motion(v: dict[str, Any]) -> tuple[Tensor, Tensor]:
-    law, walls = (v["lam"], v["mu"], v["eta"]), Walls(v["normal"], v["gap"], v["friction"])
+    law, walls = (v["lam"], v["mu"], v["eta"]), Walls(v["normal"], v["gap"], v["friction"], v["layer"])
     return elastic_motion(v["pos"], v["vel"], v["forcing"], v["mass"], law, v["cells"], walls)[:2]
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_compiled_motion_and_its_gradients_equal_the_plain_ones(kind: str) -> None:
     _, together = several(kind)
-    names = ("pos", "vel", "forcing", "lam", "mu", "eta", "gap", "friction")
+    names = ("pos", "vel", "forcing", "lam", "mu", "eta", "gap", "friction", "layer")
     results = []
     for plain in (False, True):
         values = together | {name: together[name].clone().requires_grad_() for name in names}
@@ -260,6 +262,40 @@ def test_a_node_reaches_its_plane_and_does_not_pass_it() -> None:
     depth = pos[:, 1] - float(start[:, 1].min()) + 0.2 * SPACING
     assert -1e-12 < float(depth.min()) < 0.1 * SPACING
     assert float((body.mass * at_end[:, 1]).sum()) > float((body.mass * vel[:, 1]).sum())
+
+
+def falling(damping: float, thickness: float = SPACING, frames: int = 12) -> tuple[Tensor, Tensor]:
+    """Heights over a wall and velocities of a node that flies into the layer of the wall, frame by frame. Its stiffness is 1 per frame²."""
+    rest = torch.tensor([[0.0, SPACING]], dtype=torch.float64)
+    cells = Cells.of(torch.empty(0, 3, dtype=torch.int64), rest, torch.ones(1, dtype=torch.float64), None)
+    empty, layer = torch.empty(0, dtype=torch.float64), torch.tensor([[thickness, 1.0, damping]], dtype=torch.float64)
+    pos, vel = rest, torch.tensor([[0.03 * SPACING, -0.2 * SPACING]], dtype=torch.float64)
+    heights, velocities = [], []
+    for _ in range(frames):
+        walls = replace(floor(pos), layer=layer)
+        way, vel, _ = elastic_motion(pos, vel, torch.zeros_like(pos), torch.ones(1).double(), (empty, empty, empty), cells, walls)
+        pos = pos + way
+        heights.append(pos[0, 1])
+        velocities.append(vel[0])
+    return torch.stack(heights), torch.stack(velocities)
+
+
+def test_the_layer_of_a_wall_is_a_spring_that_does_not_pull() -> None:
+    """A node bounces off half a period after it entered, at its own speed, and its least height is that of a harmonic oscillator."""
+    heights, velocities = falling(0.0)
+    assert float(velocities[-1, 1]) == pytest.approx(0.2 * SPACING, rel=0.15)
+    assert float(heights.min()) == pytest.approx(0.8 * SPACING, abs=0.02 * SPACING)
+    torch.testing.assert_close(velocities[-4:, 1], velocities[-1:, 1].expand(4))
+    torch.testing.assert_close(velocities[:, 0], torch.full_like(velocities[:, 0], 0.03 * SPACING))
+
+
+def test_the_damping_of_a_layer_takes_energy() -> None:
+    assert 0.3 * SPACING > float(falling(0.0)[1][-1, 1]) > float(falling(0.3)[1][-1, 1]) > 0.05 * SPACING
+
+
+def test_a_layer_does_not_act_beyond_its_thickness() -> None:
+    heights, _ = falling(0.3, thickness=0.3 * SPACING, frames=3)
+    torch.testing.assert_close(heights, SPACING * torch.tensor([0.8, 0.6, 0.4], dtype=torch.float64))
 
 
 def test_a_node_behind_its_plane_is_not_pushed_out_at_once() -> None:
