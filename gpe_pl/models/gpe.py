@@ -30,14 +30,12 @@ from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_proces
 from gpe_pl.nn.island_momentum import IslandMomentum, conserve, grouped, joined, moved_by_contacts
 from gpe_pl.nn.momentum_conv import RAW, EdgeState, Implementation, Interaction, MomentumConv, orient
 from gpe_pl.nn.node_loads import loads_of, plus, without_held_bodies
-from gpe_pl.nn.stress_of_cells import DeviatorOfCells
 from gpe_pl.schema import BOUNDARY, CELL, MESH_MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
 Decoder = Literal["node", "pair", "contact"]
 LevelWeights = Literal["shared", "separate"]
 MaterialEmbeddingKind = Literal["affine", "mlp", "none"]
 NodeNorm = Literal["none", "layer"]
-StressForm = Literal["network", "cells"]
 
 
 class StressError(GpeError, ValueError):
@@ -170,7 +168,6 @@ class GPE(Model):
         wall_layer: with ``elastic``, initial thickness of the learned elastic layer of walls in front of that, in rest spacings; 0 stands for no layer.
         only_contacts: with ``elastic`` and the ``contact`` decoder, the network adds forces between bodies, and nothing within bodies or at walls.
         viscous: with ``elastic``, cells also have a viscous stress with a learned constant. Choose false for data of solids without damping.
-        deviator: with ``stress`` and without ``elastic``, ``cells`` adds the deviatoric stress of cells to the network's (see ``nn.stress_of_cells``).
         island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or
             ``ignored``.
 
@@ -178,7 +175,7 @@ class GPE(Model):
         StressError: ``stress`` without a material that has a stress.
         IslandError: graphs do not contain islands and bodies, which ``island_momentum`` and the ``contact`` decoder with meshes need; or the ``contact``
             decoder is used with meshes beside other materials and without ``island_momentum``.
-        CellError: ``elastic`` or ``deviator=cells`` without cells in the graphs, or both together.
+        CellError: ``elastic`` without cells in the graphs.
     """
 
     def __init__(
@@ -200,7 +197,6 @@ class GPE(Model):
         wall_layer: Annotated[float, Field(ge=0)] = 0.0,
         only_contacts: bool = False,
         viscous: bool = True,
-        deviator: StressForm = "network",
     ) -> None:
         super().__init__(
             spec,
@@ -220,16 +216,11 @@ class GPE(Model):
             wall_layer=wall_layer,
             only_contacts=only_contacts,
             viscous=viscous,
-            deviator=deviator,
         )
         if elastic and not (spec.cells and spec.meshes and spec.islands):
             raise CellError(
                 "model.elastic=true needs graph.cells=true graph.mesh=true graph.islands=true and a material with cells, "
                 f"such as {MESH_MATERIALS[0]}; the data set has {', '.join(spec.materials)}; or choose law=none"
-            )
-        if deviator == "cells" and (elastic or not (stress and spec.cells and spec.meshes and spec.islands)):
-            raise CellError(
-                "model.deviator=cells needs model.stress=true model.elastic=false graph.cells=true graph.mesh=true graph.islands=true"
             )
         if island_momentum != "ignored" and not spec.islands:
             raise IslandError(f"model.island_momentum={island_momentum} needs graph.islands=true")
@@ -298,8 +289,6 @@ class GPE(Model):
             for layer in zeroed:  # training starts from the motion by cells and walls alone
                 for values in cast(nn.Linear, layer).parameters():
                     nn.init.zeros_(values)
-        if deviator == "cells":
-            self.deviator = DeviatorOfCells({m: spec.param_channels[m] if m in read else 0 for m in spec.meshes}, spec.dim)
         if stress:
             decoded = {m: c for m, c in spec.stress_channels.items() if not (elastic and m in spec.meshes)}  # the law knows the others'
             self.stress_decoder = nn.ModuleDict({m: mlp(hidden, hidden, c) for m, c in decoded.items()})
@@ -307,8 +296,6 @@ class GPE(Model):
     def set_units(self, acceleration: float, spacing: float, stress: float) -> None:
         if self.settings["elastic"]:
             self.elastic_bodies.set_units(acceleration, spacing, stress)
-        if self.settings["deviator"] == "cells":
-            self.deviator.set_units(acceleration, spacing, stress)
 
     def early_layers(self, num_steps: int) -> list[nn.Module]:
         constants = [self.elastic_bodies] if self.settings["elastic"] else []
@@ -371,9 +358,6 @@ class GPE(Model):
             with_stress = self._wants_stress and bool(self.spec.stress_channels)
             acceleration, velocity, of_law = self.elastic_bodies(data, acceleration, params, mass, with_stress)
             stress = stress | of_law
-        elif stress and self.settings["deviator"] == "cells":
-            params = {m: data[m].material_params for m in self.material_embedding if m in acceleration}
-            stress = plus(stress, self.deviator(data, acceleration, params))
         return Prediction(acceleration, stress, velocity)
 
     def _compiled(self, data: HeteroData, keep_absent: bool) -> Decoded | None:
