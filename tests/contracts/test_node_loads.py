@@ -285,13 +285,16 @@ def test_the_law_of_cells_feels_rollers_as_a_plane_of_symmetry() -> None:
     whole = beam(forced=False)
     half = replace(whole, prescribed=np.stack([np.arange(15) < 3, np.zeros(15, bool)], axis=1))
     made = simulator(half, "elastic", only_contacts=True)
+    law: Any = made.model.elastic_bodies.constants["elastomer"]  # type: ignore[union-attr,index]
+    with torch.no_grad():
+        law.logarithm["weight"].zero_()  # constants in which a wave does not swing back within the frame
     state = start(half, made)
     pulled = replace(state, gravity=torch.tensor([20.0, 0.0], dtype=torch.float64))
     ways = [made.step(s).pos - state.pos for s in (state, pulled)]
     grown = ways[1] - ways[0]
     assert not grown[CLAMPED, 0].any() and (grown[12:15, 0] > 0).all()
     thinner = (grown[2::3, 1] - grown[0::3, 1]) / (state.pos[2::3, 1] - state.pos[0::3, 1])
-    assert thinner[0] < 0  # a clamp would not let it become thinner
+    assert thinner[0] < -1e-3  # a clamp would not let it become thinner
 
 
 @pytest.mark.parametrize("sliding", [False, True])
