@@ -1,6 +1,6 @@
 """Least distance of liquid nodes: nodes that come nearer to each other in a step are pushed apart.
 
-A network that was trained on few trajectories of a liquid does not resist slow compression, so that nodes of a settled pool cluster. Here pairs of
+A network that was trained briefly, or on few trajectories of a liquid, may not resist slow compression, so that nodes of a settled pool cluster. Here pairs of
 nodes that are too near move apart along their connecting line, each by its share of the gap. Both get opposite impulses, so momentum and angular momentum
 do not change.
 Source of the constraint: Müller et al. 2007, "Position based dynamics", section 3.3.
