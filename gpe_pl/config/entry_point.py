@@ -41,6 +41,7 @@ from gpe_pl.files.run_folder import refuse_links
 from gpe_pl.learned.pretrained import model_name
 from gpe_pl.system import early_interrupts
 from gpe_pl.system.signatures import checked, parameters
+from gpe_pl.viz.saving import further_formats
 
 WITHOUT_KEY = {"adaptation", "comparison", "experiment", "law", "parameters", "recipe", "scaling", "scene", "solver", "tuned"}
 """Config groups that set keys under other names than their own. A command may have a key of its own by such a name, as convert has ``parameters``."""
@@ -211,7 +212,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             clean_messages()
             try:
                 check_arguments(sys.argv[1:], config_name)
-            except ConfigError as error:
+                further_formats()
+            except GpeError as error:
                 _fail(error)
             sys.argv[1:] = [quoted(argument) for argument in sys.argv[1:]]
             os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach this function, without Hydra's report

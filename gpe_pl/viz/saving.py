@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 VARIABLE = "GPE_FIGURES"
 VECTOR = ("svg", "pdf")
@@ -42,7 +43,11 @@ def save_figure(figure: Figure, path: Path, **options: Any) -> None:
 
 
 def further_formats() -> tuple[str, ...]:
-    """Return the formats that ``GPE_FIGURES`` names."""
+    """Return the formats that ``GPE_FIGURES`` names. Commands call this before they begin.
+
+    Raises:
+        FigureFormatError: it names an unknown format.
+    """
     named = tuple(part.strip().lower() for part in os.environ.get(VARIABLE, "").split(",") if part.strip())
     if wrong := [kind for kind in named if kind not in VECTOR]:
         raise FigureFormatError(

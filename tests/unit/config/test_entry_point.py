@@ -325,6 +325,17 @@ def test_a_report_that_fails_fails_the_command(
     assert str(error) in capsys.readouterr().err
 
 
+def test_an_unknown_format_of_figures_is_refused_before_anything_is_done(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setenv("GPE_FIGURES", "svg,eps")
+    with pytest.raises(SystemExit) as caught:
+        call(monkeypatch, tmp_path / "runs", lambda cfg: pytest.fail("the command began"))
+    assert caught.value.code == 2
+    assert "GPE_FIGURES=svg,eps: 'eps' must be svg or pdf" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
+
+
 def test_an_interruption_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     def task(_: DictConfig) -> None:
         raise KeyboardInterrupt
