@@ -55,9 +55,9 @@ class Uncertainty:
             log.warning("the coverage of the model's error bands is not measured: %s", unfit)
         self.coverage = None if stored is None or unfit else Coverage(stored)
         if stored is None:
-            self.unlike = UnlikeScenes(trained_limits(first), "training")
+            self.unlike = UnlikeScenes(trained_limits(first), "training", is_complete=False)
         else:
-            self.unlike = UnlikeScenes(stored.features, "calibration scenes", stored.spread)
+            self.unlike = UnlikeScenes(stored.features, "calibration scenes", is_complete=True, spread=stored.spread)
 
     def see(self, scene: PredictedScene, about: tuple[str, int, str, float]) -> Iterator[Row]:
         """Take a scene, and yield further metrics (``Coverage.add``), and the number of quantities in which it is unlike the known scenes (``num_unlike``).

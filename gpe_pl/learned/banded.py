@@ -83,9 +83,9 @@ def roll_out_with_bands(
     trajectory = rollout(combined(members, wrapped), state, num_steps, metadata, guard, see)
     own_spread = np.stack(spreads) if len(members) > 1 else None
     if bands is None:
-        unlike = UnlikeScenes(trained_limits(members[0]), "training")
+        unlike = UnlikeScenes(trained_limits(members[0]), "training", is_complete=False)
     else:
-        unlike = UnlikeScenes(bands.features, "calibration scenes", bands.spread)
+        unlike = UnlikeScenes(bands.features, "calibration scenes", is_complete=True, spread=bands.spread)
     unlike.add(watch.found, None if own_spread is None else own_spread.mean(axis=1))
     unlike.warn("this rollout")
     radius = None if bands is None else bands.radius(trajectory, own_spread, level, guarantee)

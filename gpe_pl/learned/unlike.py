@@ -2,7 +2,7 @@
 
 Each quantity has a name with its node type, such as ``speed of sand [m/s]``. Its limits are those of calibration scenes, which ``bands`` stores. Without them,
 speeds and accelerations are compared with the statistics of the training data that every checkpoint holds. Checks look at a few frames of a rollout
-(``sampled_frames``), so other steps take no longer.
+(``sampled_frames``), so other steps take no longer. A quantity that no calibration scene has is unlike; one that the training statistics lack is not checked.
 """
 
 from __future__ import annotations
@@ -155,19 +155,22 @@ class UnlikeScenes:
     Args:
         limits: limits of the quantities.
         known: name of the scenes that these are from, for messages.
+        is_complete: whether the scenes had no other quantities than those with limits, so that other quantities are unlike.
         spread: largest mean spread of an ensemble in calibration scenes, in frames 1, 2, … [m].
 
     Attributes:
         lines: what is unlike in the first scene, and the number of scenes, by quantity.
     """
 
-    def __init__(self, limits: Ranges, known: str, spread: Sequence[float] = ()) -> None:
-        self.limits, self.known, self.spread = limits, known, spread
+    def __init__(self, limits: Ranges, known: str, is_complete: bool, spread: Sequence[float] = ()) -> None:
+        self.limits, self.known, self.is_complete, self.spread = limits, known, is_complete, spread
         self.lines: dict[str, tuple[str, int]] = {}
         self.num_scenes = 0
 
     def add(self, found: Ranges, spread: np.ndarray | None = None) -> int:
         """Take the quantities of a scene and its mean spread in each frame [m]. Return the number of quantities that are unlike."""
+        if not self.is_complete:
+            found = {name: values for name, values in found.items() if name in self.limits}
         beyond = [*unlike(found, self.limits, known=self.known), *self._wide(spread)]
         for name, line in beyond:
             first, count = self.lines.get(name, (line, 0))

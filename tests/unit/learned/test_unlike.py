@@ -56,10 +56,10 @@ def test_statistics_of_training_are_limits_without_calibration(simulator: Learne
     assert trained_limits(simulator) == {}, "an untrained model knows nothing"
     simulator.standardizer.fit([simulator.builder(own)])
     limits = trained_limits(simulator)
-    found = quantities(simulator, own)
-    assert list(unlike({k: v for k, v in found.items() if k in limits}, limits)) == []
-    beyond = {name for name, _ in unlike({k: v for k, v in quantities(simulator, faster(own, 50.0)).items() if k in limits}, limits)}
-    assert "speed of sand [m/s]" in beyond
+    scenes = UnlikeScenes(limits, "training", is_complete=False)
+    assert scenes.add(quantities(simulator, own)) == 0, "distances and numbers of edges have no limits"
+    assert scenes.add(quantities(simulator, faster(own, 50.0))) >= 1
+    assert "speed of sand [m/s]" in scenes.lines
 
 
 def test_few_frames_are_looked_at(simulator: LearnedSimulator, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,11 +78,13 @@ def test_few_frames_are_looked_at(simulator: LearnedSimulator, monkeypatch: pyte
 
 
 def test_a_warning_counts_scenes(caplog: pytest.LogCaptureFixture) -> None:
-    scenes = UnlikeScenes({"speed of sand [m/s]": (0.0, 2.0)}, "calibration scenes", spread=[0.1, 0.2])
+    scenes = UnlikeScenes({"speed of sand [m/s]": (0.0, 2.0)}, "calibration scenes", is_complete=True, spread=[0.1, 0.2])
     narrow, wide = np.array([0.0, 0.1, 0.2]), np.array([0.0, 0.1, 0.6])
     assert scenes.add({"speed of sand [m/s]": (0.1, 2.1)}, narrow) == 0
     assert scenes.add({"speed of sand [m/s]": (0.1, 6.0)}, narrow) == 1
     assert scenes.add({"speed of sand [m/s]": (0.1, 9.0)}, wide) == 2
+    new = UnlikeScenes(scenes.limits, "calibration scenes", is_complete=True)
+    assert new.add({"edges per node of sand": (3.0, 4.0)}) == 1, "calibration scenes have no such quantity"
     with caplog.at_level(logging.WARNING):
         scenes.warn("test")
     speed, spread = caplog.messages
