@@ -152,6 +152,10 @@ def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
         parent = parent.rpartition(".")[0]  # the misspelt part is further up in the key
         leaf = key.removeprefix(f"{parent}.").partition(".")[0]
     node = OmegaConf.select(composed, parent) if parent else composed
+    if not parent and "." in key and leaf in groups(config_name):
+        nested = next((place for place in _places(composed, "") if place.endswith(f".{key}")), None)
+        meant = f"; did you mean {nested!r}?" if nested else ""
+        return f"{key}: {leaf!r} is the name of a choice and has no keys, write {leaf}=CHOICE{meant}"
     keys = sorted({*map(str, node), *(() if parent else groups(config_name))})
     elsewhere = [
         place for part in LIKELY if part in composed for place in _places(composed[part], f"{part}.") if place.rpartition(".")[2] == key

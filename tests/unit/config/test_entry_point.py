@@ -131,6 +131,14 @@ def complaint(name: str, *overrides: str) -> str:
             "trianing.num_steps=5",
             ["trianing.num_steps: unknown key 'trianing'; did you mean 'training'?; valid keys: ", "training", "experiment"],
         ),
+        (
+            "fit",
+            "comparison.budget_minutes=3",
+            [
+                "'comparison' is the name of a choice and has no keys, write comparison=CHOICE",
+                "did you mean 'size.comparison.budget_minutes'?",
+            ],
+        ),
         ("fit", "training.noise_std=0.3", ["unknown key 'noise_std'; valid keys of training: ", "velocity_noise_of_change"]),
         (
             "fit",
