@@ -2,7 +2,8 @@
 
 An interval contains all values whose misfit is at most a threshold above the smallest one (``profile``), as in intervals from a likelihood ratio. Scenes whose
 motion says little about an unknown have a flat curve, and so a wide interval. A model that answers too low for every scene is corrected by ``truth ≈ a + b ·
-answer``, a line fitted by least squares in the coordinate of the unknown. It moves the ends of intervals, too.
+answer``, a line in the coordinate of the unknown. It moves the ends of intervals, too. It is fitted by repeated medians (Siegel, Biometrika 69, 1982), because some
+answers are far off, such as those at a bound of the search. Least squares would let them spoil the correction of all others.
 
 The threshold is split conformal (``metrics.conformal``). The score of a calibration scene is the misfit above the smallest of the answer that would have been
 corrected to its true value. Its line is fitted without the scene, so no scene corrects its own answer.
@@ -15,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int
+from scipy.stats import siegelslopes
 
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.identification.profile import Profile
@@ -117,5 +119,5 @@ def _line(known: Sequence[Known]) -> tuple[float, float]:
     estimate, truth = (np.array([getattr(own, name) for own in known]) for name in ("estimate", "truth"))
     if np.ptp(estimate) == 0:
         return float(np.mean(truth - estimate)), 1.0
-    slope, offset = np.polyfit(estimate, truth, 1)
+    slope, offset = siegelslopes(truth, estimate)
     return (float(offset), float(slope)) if slope > 0 else (0.0, 1.0)
