@@ -130,7 +130,7 @@ def draw(axes: Axes, name: str, rows: list[list[str]]) -> None:
         axes.set_xticks(range(len(own)), ["end" if cells[3] == FULL else cells[3].removesuffix("s") for cells in own])
     axes.set_title(name, fontsize=8)
     axes.set_xlabel("time [s]", fontsize=7.5)
-    axes.set_ylim(60, 101)
+    axes.set_ylim(25, 101)
     axes.tick_params(labelsize=6.5)
     axes.spines[["top", "right"]].set_visible(False)
 
