@@ -1,9 +1,11 @@
 """Calibration of intervals on scenes with known unknowns, so that they have a guaranteed coverage.
 
 An interval contains all values whose misfit is at most a threshold above the smallest one (``profile``), as in intervals from a likelihood ratio. Scenes whose
-motion says little about an unknown have a flat curve, and so a wide interval. A model that answers too low for every scene is corrected by ``truth ≈ a + b ·
-answer``, a line in the coordinate of the unknown. It moves the ends of intervals, too. It is fitted by repeated medians (Siegel, Biometrika 69, 1982), because some
-answers are far off, such as those at a bound of the search. Least squares would let them spoil the correction of all others.
+motion says little about an unknown have a flat curve, and so a wide interval.
+
+A model that answers too low for every scene is corrected by ``truth ≈ a + b · answer``, a line in the coordinate of the unknown. It moves the ends of
+intervals, too. It is fitted by repeated medians (Siegel, Biometrika 69, 1982), because some answers are far off, such as those at a bound of the search. Least
+squares would let them spoil the correction of all others.
 
 The threshold is split conformal (``metrics.conformal``). The score of a calibration scene is the misfit above the smallest of the answer that would have been
 corrected to its true value. Its line is fitted without the scene, so no scene corrects its own answer.
