@@ -72,7 +72,7 @@ def identify_scenes(cfg: DictConfig) -> None:
         observations,
         shooting,
         search,
-        _calibrations(settings),
+        *_calibrations(cfg, settings),
     )
     with locked(folder), recorded(folder, "identify", sys.argv[1:], cfg.paths.runs):
         claim(folder, _identity(cfg), results=["scenes/*"])
@@ -102,20 +102,38 @@ def scenes(path: Path, number: int | None) -> Iterator[tuple[str, Trajectory]]:
         yield f"{file.stem}_{name}", read_trajectory(file, name)
 
 
-def _calibrations(settings: Settings) -> dict[str, dict[str, Any]]:
-    """Return the calibration of each simulator and unknown from an earlier results folder; empty without one."""
+def _calibrations(cfg: DictConfig, settings: Settings) -> tuple[dict[str, dict[str, Any]], set[str]]:
+    """Return the calibration of each simulator and unknown from an earlier results folder, and the digests of its motions; both empty without one.
+
+    Raises:
+        ConfigError: there are no answers, too few, or answers of another model or with other settings.
+    """
     from gpe_pl.evaluation.identification.answer import MODEL, SOLVER, known_of, read_answers
-    from gpe_pl.evaluation.identification.calibration import calibrated
+    from gpe_pl.evaluation.identification.calibration import FewScenesError, calibrated
+    from gpe_pl.files.run_folder import CONFIG, config_in
 
     if settings.calibration is None:
-        return {}
-    found = {}
-    for simulator in (MODEL, SOLVER):
-        known = known_of(read_answers(Path(settings.calibration), simulator))
-        found[simulator] = {name: calibrated(own, settings.level) for name, own in known.items()}
-    if not any(found.values()):
-        raise ConfigError(f"calibration={settings.calibration}: has no answers; name the results folder of an earlier run of this command")
-    return found
+        if settings.level != Settings.level:
+            raise ConfigError(f"level={settings.level:g}: intervals of another level need calibration=FOLDER")
+        return {}, set()
+    folder, key = Path(settings.calibration), f"calibration={settings.calibration}"
+    kinds = (MODEL, SOLVER) if settings.simulator == "both" else (settings.simulator,)
+    answers = {kind: read_answers(folder, kind) for kind in kinds}
+    if not any(answers.values()) or not (folder / CONFIG).is_file():
+        raise ConfigError(f"{key}: has no answers; name the results folder of an earlier run of this command")
+    stored, own = config_in(folder / CONFIG), _identity(cfg)
+    compared = ("per_body", "observations", "shooting", "search", *(("checkpoint",) if MODEL in kinds else ()))
+    if different := [name for name in compared if stored.get(name) != own[name]]:
+        shown = "; ".join(f"{name}: {stored.get(name)} there, {own[name]} now" for name in different)
+        raise ConfigError(f"{key}: was made with other settings ({shown}); identify its scenes again with these")
+    found: dict[str, dict[str, Any]] = {}
+    for kind, seen in answers.items():
+        for name, known in known_of(seen).items():
+            try:
+                found.setdefault(kind, {})[name] = calibrated(known, settings.level)
+            except FewScenesError as error:
+                raise ConfigError(f"{key}: {name} by simulator={kind}: {error}") from None
+    return found, {answer.observed for own in answers.values() for answer in own}
 
 
 def _plain(cfg: DictConfig) -> dict[str, Any]:

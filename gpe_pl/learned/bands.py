@@ -16,11 +16,12 @@ as ``{stem}.ensemble_of_{K}.bands.json``. The file holds the checksums of the ch
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -33,6 +34,8 @@ from gpe_pl.learned.verdicts import checksum
 from gpe_pl.metrics import displacement
 from gpe_pl.metrics.conformal import conformal_factor, conformal_factor_of_nodes
 from gpe_pl.trajectory.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
 
 Guarantee = Literal["nodes", "scene"]
 """What bands promise: a fraction of the nodes on average, or this fraction with a probability."""
@@ -85,8 +88,10 @@ class Bands:
         """Return the factors of frames 0, 1, …; the factor of frame 0 is 0.
 
         Raises:
-            ValueError: bands of this level are not stored.
+            ValueError: bands of this level are not stored, or there is no such guarantee.
         """
+        if guarantee not in get_args(Guarantee):
+            raise ValueError(f"guarantee={guarantee!r}: must be {' or '.join(get_args(Guarantee))}")
         stored = self.nodes if guarantee == "nodes" else self.scene
         if f"{level:g}" not in stored:
             raise ValueError(f"level={level:g}: bands are stored for {', '.join(stored)}")
@@ -209,4 +214,7 @@ def read(*checkpoints: Path | str) -> Bands | None:
     except ValidationError as error:
         fault = error.errors()[0]
         raise sealed.SealError(f"{path}: {'.'.join(map(str, fault['loc']))}: {fault['msg']}; {advice}") from None
-    return bands if bands.checkpoints == [checksum(checkpoint_path(c)) for c in checkpoints] else None
+    if bands.checkpoints != [checksum(checkpoint_path(c)) for c in checkpoints]:
+        log.warning("%s: holds error bands of another checkpoint than the one beside it, which are not used; %s", path, advice)
+        return None
+    return bands

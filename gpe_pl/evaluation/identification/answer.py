@@ -16,6 +16,8 @@ from gpe_pl.files import sealed
 
 ADVICE = "delete the file and identify the scene again"
 MODEL, SOLVER = "model", "solver"
+POOR = 1.0
+"""Typical distance of rollouts from the motion, from which on an answer carries a warning [spacings]."""
 FOLDER = "scenes"
 """Subfolder of a results folder with one file per scene and simulator."""
 
@@ -66,6 +68,7 @@ class Answer:
 
     Attributes:
         scene: name of the scene.
+        observed: digest of the observed motion (``Observations.digest``).
         simulator: ``model`` or ``solver``.
         values: answers for the unknowns.
         level: nominal coverage of the intervals.
@@ -80,6 +83,7 @@ class Answer:
     """
 
     scene: str
+    observed: str
     simulator: str
     values: tuple[Value, ...]
     level: float
@@ -99,8 +103,15 @@ class Answer:
         """Return the answer for an unknown by its name, such as ``sand.friction_angle``."""
         return next(value for value in self.values if value.name == name)
 
+    @property
+    def warning(self) -> str:
+        """What a reader should know about the fit; empty if the rollouts are nearer than ``POOR`` to the motion."""
+        error = math.exp(self.misfit / 2)
+        return "" if error < POOR else f"{self.simulator} does not fit: its rollouts are {error:.2g} spacings away from the motion"
+
     def __str__(self) -> str:
         lines = [f"{value.label} {value.text}" + (f", at the {value.at_bound} bound" if value.at_bound else "") for value in self.values]
+        lines += [self.warning] if self.warning else []
         return "; ".join(lines) + ("" if self.num_calibration else " [interval not calibrated]")
 
     def write(self, folder: Path) -> None:
@@ -123,7 +134,8 @@ def read_answer(path: Path) -> Answer:
         AnswerError: another version of the package wrote it.
     """
     found: dict[str, Any] = sealed.read(path, ADVICE)
-    if any(value.keys() != Value.__dataclass_fields__.keys() for value in found["values"]):
+    is_own = found.keys() == Answer.__dataclass_fields__.keys()
+    if not is_own or any(value.keys() != Value.__dataclass_fields__.keys() for value in found["values"]):
         raise AnswerError(f"{path}: is an answer of another version; {ADVICE}")
     values = tuple(Value(**{**value, "bounds": tuple(value["bounds"])}) for value in found.pop("values"))
     return Answer(values=values, tried=tuple(map(tuple, found.pop("tried"))), **found)
@@ -155,14 +167,14 @@ def value_of(unknown: Unknown, z: float, profile: Profile, calibration: Calibrat
 
 
 def known_of(answers: Iterable[Answer]) -> dict[str, list[Known]]:
-    """Return answers whose truth is known, by name of the unknown. All bodies of a scene count as the same unknown."""
+    """Return answers whose truth is known, by name of the unknown. All bodies of a scene have the same unknown and scene."""
     found: dict[str, list[Known]] = {}
     for answer in answers:
         for k, value in enumerate(answer.values):
             if value.truth is not None:
                 low, high = map(value.coordinate, value.bounds)
                 profile = Profile.of(((value.coordinate(row[k]), row[-1]) for row in answer.tried), (low, high))
-                known = Known(value.coordinate(value.raw), value.coordinate(value.truth), profile)
+                known = Known(value.coordinate(value.raw), value.coordinate(value.truth), profile, answer.scene)
                 found.setdefault(value.name.partition("#")[0], []).append(known)
     return found
 
@@ -177,5 +189,6 @@ def side_by_side(answers: Mapping[str, Answer]) -> Sequence[str]:
         notes = [
             f"{answer.simulator} at the {answer[value.name].at_bound} bound" for answer in answers.values() if answer[value.name].at_bound
         ]
+        notes += [answer.warning for answer in answers.values() if answer.warning]
         lines.append(", ".join(parts) + (f"; {', '.join(notes)}" if notes else ""))
     return lines

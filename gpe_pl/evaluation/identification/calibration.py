@@ -8,12 +8,13 @@ intervals, too. It is fitted by repeated medians (Siegel, Biometrika 69, 1982), 
 squares would let them spoil the correction of all others.
 
 The threshold is split conformal (``metrics.conformal``). The score of a calibration scene is the misfit above the smallest of the answer that would have been
-corrected to its true value. Its line is fitted without the scene, so no scene corrects its own answer.
+corrected to its true value. Its line is fitted without the scene, so no scene corrects its own answer. Bodies of one scene are not independent, so a scene
+counts once, with the largest score of its bodies.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,11 +35,12 @@ class FewScenesError(GpeError, ValueError):
 
 @dataclass(frozen=True)
 class Known:
-    """Answer for an unknown with a known true value, in its coordinate: the value or its logarithm."""
+    """Answer for an unknown with a known true value, in its coordinate: the value or its logarithm. A scene has several answers if it has several bodies."""
 
     estimate: float
     truth: float
     profile: Profile
+    scene: str
 
 
 @dataclass(frozen=True)
@@ -70,16 +72,13 @@ def calibrated(known: Sequence[Known], level: float = 0.9) -> Calibration:
     Raises:
         FewScenesError: there are fewer than ``fewest_scenes(level)``.
     """
-    least = fewest_scenes(level)
-    if len(known) < least:
+    least, number = fewest_scenes(level), len({own.scene for own in known})
+    if number < least:
         raise FewScenesError(
-            f"{len(known)} calibration scenes; intervals of {100 * level:g} % need at least {least}: identify more scenes with known values"
+            f"{number} calibration scenes; intervals of {100 * level:g} % need at least {least}: identify more scenes with known values"
         )
-    scores = []
-    for k, own in enumerate(known):
-        offset, slope = _line([*known[:k], *known[k + 1 :]])
-        scores.append(own.profile.above((own.truth - offset) / slope))
-    return Calibration(*_line(known), conformal_factor(scores, level), len(known), level)
+    scores = _scores(known, lambda own, offset, slope: own.profile.above((own.truth - offset) / slope))
+    return Calibration(*_line(known), conformal_factor(scores, level), number, level)
 
 
 def cross_calibrated(
@@ -88,8 +87,8 @@ def cross_calibrated(
     """Return the corrected answer of each scene and the ends of its interval, calibrated on all scenes that are not in its part.
 
     Args:
-        known: the scenes.
-        parts: number of the part of each scene.
+        known: the answers.
+        parts: number of the part of each answer; those of one scene belong to one part.
         level: nominal coverage.
         adapts: let widths follow each scene's profile. False gives all scenes one width, the quantile of the absolute errors, for comparison.
 
@@ -109,11 +108,16 @@ def cross_calibrated(
 
 def _width(known: Sequence[Known], level: float) -> float:
     """Return the half-width of intervals of one width around corrected answers."""
-    scores = []
-    for k, own in enumerate(known):
-        offset, slope = _line([*known[:k], *known[k + 1 :]])
-        scores.append(abs(own.truth - offset - slope * own.estimate))
-    return conformal_factor(scores, level)
+    return conformal_factor(_scores(known, lambda own, offset, slope: abs(own.truth - offset - slope * own.estimate)), level)
+
+
+def _scores(known: Sequence[Known], score: Callable[[Known, float, float], float]) -> list[float]:
+    """Return the largest score of each scene, a function of an answer and of offset and slope of the line through the other scenes."""
+    found = []
+    for scene in dict.fromkeys(own.scene for own in known):
+        line = _line([own for own in known if own.scene != scene])
+        found.append(max(score(own, *line) for own in known if own.scene == scene))
+    return found
 
 
 def _line(known: Sequence[Known]) -> tuple[float, float]:

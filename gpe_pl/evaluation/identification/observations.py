@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated
@@ -14,7 +15,10 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 
 from gpe_pl.errors import GpeError
+from gpe_pl.trajectory.store import digest, stored_arrays, stored_attributes
 from gpe_pl.trajectory.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
 
 SMOOTHED_FRAMES, SMOOTHED_ORDER = 11, 3
 """Length and order of the polynomials (Savitzky–Golay) that smooth noisy positions."""
@@ -31,7 +35,7 @@ class ObservationSettings:
     Attributes:
         nodes: fraction of the nodes that are observed after the start; the others are drawn at random.
         every: one of so many frames is observed.
-        noise: standard deviation of the noise in the positions [m]. Above 0, starting states are smoothed.
+        noise: standard deviation of the noise in the positions [m]. Above 0, starting states are smoothed, unless nodes are hidden or frames are few.
         added_noise: standard deviation of noise that is added first [m], to try out what noise does.
         seed: seed of the draws.
     """
@@ -84,6 +88,17 @@ class Observations:
         return not self.seen[frames].all()
 
     @cached_property
+    def digest(self) -> str:
+        """SHA-256 digest of the motion and of what is observed of it."""
+        arrays = {**stored_arrays(self.trajectory), "seen": self.seen, "noise": np.array(self.noise)}
+        return digest(arrays, stored_attributes(self.trajectory))
+
+    @cached_property
+    def first_frame(self) -> int:
+        """First frame that is known: 0 if nodes are hidden, because the start has to be known then."""
+        return 0 if self.has_hidden_nodes else int(np.flatnonzero(self.seen.any(axis=1))[0])
+
+    @cached_property
     def last_frame(self) -> int:
         return int(np.flatnonzero(self.seen.any(axis=1))[-1])
 
@@ -95,6 +110,9 @@ class Observations:
         """
         frames = np.flatnonzero(self.seen.any(axis=1))
         is_complete = len(frames) == self.trajectory.num_frames
+        if self.noise and (self.has_hidden_nodes or len(frames) <= SMOOTHED_FRAMES):
+            why = "some nodes are hidden" if self.has_hidden_nodes else f"fewer than {SMOOTHED_FRAMES + 1} frames are observed"
+            log.warning("observations.noise: rollouts start from the noisy positions as they are, because %s", why)
         if self.has_hidden_nodes or (is_complete and self.noise == 0):
             return self.trajectory
         if self.trajectory.metadata.periodicity:
@@ -102,7 +120,8 @@ class Observations:
         pos: Float64[np.ndarray, "frame node dim"] = self.trajectory.pos.astype(np.float64)
         if self.noise and len(frames) > SMOOTHED_FRAMES:
             pos[frames] = savgol_filter(pos[frames], SMOOTHED_FRAMES, SMOOTHED_ORDER, axis=0)
+        known, vel = np.arange(frames[0], frames[-1] + 1), self.trajectory.vel.astype(np.float64)
         if not is_complete:
-            inner = np.arange(frames[0], frames[-1] + 1)
-            pos[inner] = CubicSpline(frames, pos[frames], axis=0)(inner)
-        return replace(self.trajectory, pos=pos, vel=np.gradient(pos, self.trajectory.metadata.frame_dt, axis=0))
+            pos[known] = CubicSpline(frames, pos[frames], axis=0)(known)
+        vel[known] = np.gradient(pos[known], self.trajectory.metadata.frame_dt, axis=0, edge_order=2 if len(known) > 2 else 1)
+        return replace(self.trajectory, pos=pos, vel=vel)

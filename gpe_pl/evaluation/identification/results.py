@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -24,7 +24,7 @@ from gpe_pl.evaluation.identification.answer import (
     side_by_side,
 )
 from gpe_pl.evaluation.identification.calibration import Calibration, cross_calibrated
-from gpe_pl.evaluation.identification.observations import Observations, ObservationSettings
+from gpe_pl.evaluation.identification.observations import ObservationError, Observations, ObservationSettings
 from gpe_pl.evaluation.identification.pictures import misfit_figure
 from gpe_pl.evaluation.identification.scene import SolverError, identify, solver_bounds, solver_of, trained_bounds
 from gpe_pl.evaluation.identification.search import SearchSettings
@@ -54,6 +54,7 @@ class Task:
         simulators: ``model``, ``solver``, or both.
         observations, shooting, search: settings.
         calibrations: calibration by simulator and name of the unknown.
+        calibrated_on: digests of the motions of the calibration (``Observations.digest``).
     """
 
     model: LearnedSimulator
@@ -65,12 +66,15 @@ class Task:
     shooting: ShootingSettings
     search: SearchSettings
     calibrations: Mapping[str, Mapping[str, Calibration]]
+    calibrated_on: Collection[str] = ()
 
     def run(self, name: str, trajectory: Trajectory, folder: Path) -> Iterator[str]:
         """Identify one scene, write the answers and pictures into a folder, and yield lines for readers."""
         self.model.check_scene(trajectory.metadata)
         observed = Observations.of(trajectory, self.observations)
         bounds = {**solver_bounds(trajectory.metadata), **trained_bounds(self.model), **self.bounds}
+        if observed.digest in self.calibrated_on:
+            raise ObservationError(f"{name}: this motion is one of those that the calibration is from; calibrate on other scenes")
         answers: dict[str, Answer] = {}
         is_new = False
         for kind in self.simulators:
@@ -91,7 +95,11 @@ class Task:
                 answer.write(folder)
                 is_new = True
             answers[kind] = read_answer(path)
-        sought = unknowns_of(trajectory, self.unknowns, bounds, self.per_body)
+            if answers[kind].observed != observed.digest:
+                raise ObservationError(
+                    f"{path}: is the answer for another motion than that of {name} in the trajectories now; choose another name=… or delete {folder}"
+                )
+        sought = unknowns_of(observed.completed, self.unknowns, bounds, self.per_body)
         if is_new:
             save_figure(misfit_figure(answers), folder / FOLDER / f"{name}_misfit.png", dpi=110)
             save_figure(self._motion(trajectory, sought, answers), folder / FOLDER / f"{name}_motion.png", dpi=110)
@@ -171,9 +179,10 @@ def _summary(answers: Mapping[str, list[Answer]]) -> list[str]:
             values, level, is_calibrated = [value for _, value in found], found[0][0].level, found[0][0].num_calibration > 0
             given = np.array([[v.coordinate(end) for end in (v.estimate, v.low, v.high)] for v in values])
             rows = {"earlier run" if is_calibrated else "none": given}
-            number, least = len(known), fewest_scenes(level)
+            _, place = np.unique([own.scene for own in known], return_inverse=True)
+            number, least = int(place.max()) + 1, fewest_scenes(level)
             if not is_calibrated and number > least:
-                half, others = (np.arange(number) % 2, "the other half") if number >= 2 * least else (np.arange(number), "other scenes")
+                half, others = (place % 2, "the other half") if number >= 2 * least else (place, "other scenes")
                 rows[others] = cross_calibrated(known, half, level)
                 rows[f"{others}, one width"] = cross_calibrated(known, half, level, adapts=False)
             num_at_bound = str(sum(bool(value.at_bound) for value in values))

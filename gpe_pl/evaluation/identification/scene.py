@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,8 +15,8 @@ from gpe_pl.evaluation.identification.calibration import Calibration
 from gpe_pl.evaluation.identification.observations import Observations
 from gpe_pl.evaluation.identification.profile import Profile
 from gpe_pl.evaluation.identification.search import Found, SearchSettings, search
-from gpe_pl.evaluation.identification.shooting import Shooting, ShootingSettings, shooting
-from gpe_pl.evaluation.identification.unknowns import Bounds, unknowns_of
+from gpe_pl.evaluation.identification.shooting import FAILED, Shooting, ShootingError, ShootingSettings, shooting
+from gpe_pl.evaluation.identification.unknowns import Bounds, UnknownError, unknowns_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import Simulator
 from gpe_pl.schema import MATERIALS
@@ -70,8 +71,12 @@ def identify(
     seen = observed if isinstance(observed, Observations) else Observations.of(observed)
     began, processor = time.monotonic(), time.process_time()
     ranges = {**(trained_bounds(simulator) if isinstance(simulator, LearnedSimulator) else {}), **(bounds or {})}
-    rollouts = shooting(simulator, seen, unknowns_of(seen.trajectory, unknowns, ranges, per_body), shooting_settings)
+    rollouts = shooting(simulator, seen, unknowns_of(seen.completed, unknowns, ranges, per_body), shooting_settings)
     found = search(rollouts, search_settings, on_progress)
+    if not found.misfit < math.log(FAILED):
+        raise ShootingError(
+            f"{scene}: every rollout failed, with all {len(found.tried)} values that were tried; check units, bounds and the observed motion"
+        )
     answer = _answer(scene, rollouts, found, calibration or {})
     return replace(answer, seconds=round(time.monotonic() - began, 2), processor_seconds=round(time.process_time() - processor, 2))
 
@@ -79,7 +84,10 @@ def identify(
 def _answer(scene: str, rollouts: Shooting, found: Found, calibration: Mapping[str, Calibration]) -> Answer:
     """Return the answer of a search, without its times."""
     sought = rollouts.unknowns.items
-    chosen = [calibration.get(unknown.name.partition("#")[0], Calibration()) for unknown in sought]
+    names = [unknown.name.partition("#")[0] for unknown in sought]
+    if calibration and (missing := [name for name in names if name not in calibration]):
+        raise UnknownError(f"{missing[0]}: the calibration is for {', '.join(calibration)}; calibrate it, too, or leave it out")
+    chosen = [calibration[name] if calibration else Calibration() for name in names]
     values = []
     for k, (unknown, own) in enumerate(zip(sought, chosen, strict=True)):
         tried = ((unknown.coordinate(float(unknown.at(float(z[k])))), misfit) for z, misfit in found.tried)
@@ -87,6 +95,7 @@ def _answer(scene: str, rollouts: Shooting, found: Found, calibration: Mapping[s
         values.append(value_of(unknown, float(found.z[k]), profile, own))
     return Answer(
         scene=scene,
+        observed=rollouts.observations.digest,
         simulator=MODEL if isinstance(rollouts.simulator, LearnedSimulator) else SOLVER,
         values=tuple(values),
         level=chosen[0].level,

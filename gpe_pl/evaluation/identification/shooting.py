@@ -149,7 +149,12 @@ def shooting(simulator: Simulator, observations: Observations, unknowns: Unknown
     """
     s = settings or ShootingSettings()
     is_learned, completed = isinstance(simulator, LearnedSimulator), observations.completed
-    first = simulator.builder.config.history if isinstance(simulator, LearnedSimulator) and not unknowns.needs_start else 0
+    first = observations.first_frame
+    if first and unknowns.needs_start:
+        raise ShootingError(
+            f"an initial velocity is sought, but the first observed frame is {first}; begin the trajectory with an observed frame"
+        )
+    first += simulator.builder.config.history if isinstance(simulator, LearnedSimulator) and not unknowns.needs_start else 0
     can_restart = is_learned or (isinstance(simulator, Restartable) and simulator.can_restart)
     is_single = observations.has_hidden_nodes or unknowns.needs_start or not can_restart
     length = min(s.single_frames if is_single else s.horizon, observations.last_frame - first)
@@ -157,11 +162,13 @@ def shooting(simulator: Simulator, observations: Observations, unknowns: Unknown
         raise ShootingError(
             f"the motion has {observations.last_frame + 1} observed frames; rollouts start at frame {first}, so it needs more"
         )
-    if not can_restart and observations.trajectory.start_time > 0:
+    if not can_restart and (observations.trajectory.start_time > 0 or observations.first_frame > 0):
         raise ShootingError("the motion begins after the start of the scene, and this solver needs the start; choose simulator=model")
     last = observations.last_frame - length
     number = 1 if is_single else min(s.num_windows, 1 + (last - first) // max(1, length // 2))
     frames = sorted({int(f) for f in np.linspace(first, last if number > 1 else first, number).round()})
+    if not any(observations.seen[f + 1 : f + length + 1].any() for f in frames):
+        raise ShootingError(f"no frame within shooting.horizon={s.horizon} of the starts {frames} is observed; choose a longer horizon")
     if isinstance(simulator, LearnedSimulator):
         simulator = simulator.configured(clamps_parameters=False)
         thrown = unknowns.needs_start

@@ -12,7 +12,8 @@ from array_api_compat import array_namespace
 from scipy.spatial import cKDTree
 
 from gpe_pl.errors import GpeError
-from gpe_pl.schema import MATERIALS, node_code
+from gpe_pl.errors.printable import did_you_mean
+from gpe_pl.schema import MATERIALS, MaterialParameter, node_code
 from gpe_pl.trajectory.cells import bodies, components
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -27,6 +28,9 @@ STEEPEST = 45.0
 """Largest angle between the sought direction of gravity and the stored one [deg]."""
 AT_BOUND = 0.01
 """Answers nearer to a bound than this fraction of the range count as lying at the bound."""
+
+PARAMETERS = {f"{material}.{parameter.name}" for material, own in MATERIALS.items() for parameter in own}
+"""All names of material parameters."""
 
 Bounds = Mapping[str, tuple[float, float]]
 """Lowest and highest value of unknowns, by name ``MATERIAL.PARAMETER``."""
@@ -147,9 +151,13 @@ def unknowns_of(trajectory: Trajectory, wanted: Sequence[str] | None, ranges: Bo
         UnknownError: the scene has no such unknown, or a parameter has no bounds. The message names it.
     """
     found: list[Unknown] = []
+    if misspelt := sorted(set(ranges) - PARAMETERS):
+        raise UnknownError(f"bounds: {misspelt[0]!r} is no MATERIAL.PARAMETER{did_you_mean(misspelt[0], sorted(PARAMETERS))}")
     groups = scene_bodies(trajectory) if per_body else []
     for name in materials_of(trajectory) if wanted is None else wanted:
         material, _, parameter = name.partition(".")
+        if material in (VELOCITY, GRAVITY) and parameter:
+            raise UnknownError(f"unknowns: {name!r}: {material} has no parts; write {material}")
         if material == VELOCITY:
             found += _velocities(trajectory, groups)
         elif material == GRAVITY:
@@ -158,6 +166,9 @@ def unknowns_of(trajectory: Trajectory, wanted: Sequence[str] | None, ranges: Bo
             found += _parameters(trajectory, material, parameter, ranges, groups)
     if not found:
         raise UnknownError("unknowns=[]: name at least one, such as sand.friction_angle")
+    names = [unknown.name for unknown in found]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UnknownError(f"unknowns: {twice[0]} is named twice; name a parameter, or its material, once")
     return Unknowns(tuple(found))
 
 
@@ -201,8 +212,7 @@ def _parameters(trajectory: Trajectory, material: str, parameter: str, ranges: B
         name = f"{material}.{spec.name}"
         if parameter not in ("", spec.name):
             continue
-        if name not in ranges or not ranges[name][0] < ranges[name][1] < math.inf:
-            raise UnknownError(f"{name}: has no range in training; give one with bounds='{{{name}:[LOW,HIGH]}}'")
+        _check_range(name, spec, ranges.get(name))
         for suffix, label, nodes in _grouped(rows, groups):
             values = np.unique(trajectory.material_params[nodes, stored[spec.name]])
             truth = float(values[0]) if len(values) == 1 else math.nan
@@ -215,8 +225,21 @@ def _parameters(trajectory: Trajectory, material: str, parameter: str, ranges: B
     return found
 
 
+def _check_range(name: str, spec: MaterialParameter, bounds: tuple[float, float] | None) -> None:
+    if bounds is None or not all(map(math.isfinite, bounds)) or bounds[0] == bounds[1]:
+        raise UnknownError(f"{name}: has no range in training; give one with bounds='{{{name}:[LOW,HIGH]}}'")
+    low, high = bounds
+    if low > high:
+        raise UnknownError(f"bounds of {name}: [{low:g}, {high:g}]: the first must be below the second")
+    if not (spec.accepts(low) and spec.accepts(high)):
+        raise UnknownError(f"bounds of {name}: [{low:g}, {high:g}]: must be {spec.rule}")
+
+
 def _velocities(trajectory: Trajectory, groups: list[np.ndarray]) -> list[Unknown]:
     steps = np.abs(np.diff(trajectory.pos.astype(np.float64), axis=0)) / trajectory.metadata.frame_dt
+    steps = steps[np.isfinite(steps).all(axis=(1, 2))]
+    if not len(steps):
+        raise UnknownError(f"unknowns: {VELOCITY}: the trajectory has no two successive frames with finite positions")
     fastest = 1.5 * float(np.quantile(steps.max(axis=(1, 2)), 0.95)) + 1e-6
     return [
         Unknown(f"{VELOCITY}.{axis}{suffix}", f"initial velocity {axis}{label}", "m/s", -fastest, fastest, False, VELOCITY, k, nodes, truth)

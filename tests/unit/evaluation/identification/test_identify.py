@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,63 @@ def test_rollouts_that_fail_do_not_win() -> None:
             return super().step(state)
 
     assert identify(Fails(), thrown(32.0), bounds=BOUNDS).values[0].estimate == pytest.approx(32.0, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "bounds", "message"),
+    [
+        (["sand", "sand.friction_angle"], BOUNDS, r"unknowns: sand\.friction_angle is named twice"),
+        (["velocity.x"], BOUNDS, r"unknowns: 'velocity\.x': velocity has no parts; write velocity"),
+        (None, {"sand.friction": (10.0, 50.0)}, r"bounds: 'sand\.friction' is no MATERIAL\.PARAMETER; did you mean 'sand\.friction_angle'"),
+        (None, {"sand.friction_angle": (50.0, 10.0)}, r"bounds of sand\.friction_angle: \[50, 10\]: the first must be below the second"),
+        (None, {"sand.friction_angle": (-50.0, 10.0)}, r"bounds of sand\.friction_angle: \[-50, 10\]: must be finite and not negative"),
+    ],
+)
+def test_unknowns_and_bounds_without_meaning_are_refused(
+    wanted: list[str] | None, bounds: dict[str, tuple[float, float]], message: str
+) -> None:
+    with pytest.raises(UnknownError, match=message):
+        identify(Drag(), thrown(), wanted, bounds=bounds)
+
+
+def test_a_logarithmic_parameter_needs_positive_bounds() -> None:
+    with pytest.raises(UnknownError, match=r"\[0, 0\.5\]: must be positive and finite"):
+        identify(Drag(), thrown(0.03, "fluid"), bounds={"fluid.kinematic_viscosity": (0.0, 0.5)})
+
+
+def test_frames_before_the_first_observed_one_are_not_used() -> None:
+    seen = thrown()
+    flags = np.ones(seen.pos.shape[:2], dtype=bool)
+    flags[:12] = False
+    hidden = seen.pos.copy()
+    hidden[:12] = np.nan
+    answers = [identify(Drag(), Observations(replace(seen, pos=pos), flags), bounds=BOUNDS) for pos in (seen.pos, hidden)]
+    assert answers[0].values == answers[1].values
+    assert answers[0]["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=3.0), "velocities at the start follow from positions"
+
+
+def test_windows_without_an_observed_frame_are_refused() -> None:
+    with pytest.raises(ShootingError, match=r"no frame within shooting\.horizon=1 of the starts \[0\] is observed"):
+        settings = ShootingSettings(horizon=1, num_windows=1)
+        identify(Drag(), Observations.of(thrown(), ObservationSettings(every=4)), bounds=BOUNDS, shooting_settings=settings)
+
+
+def test_a_scene_in_which_every_rollout_fails_has_no_answer() -> None:
+    @dataclass(frozen=True)
+    class Fails(Drag):
+        def step(self, state: State) -> State:
+            raise SimulationError("failed")
+
+    with pytest.raises(ShootingError, match="first: every rollout failed, with all"):
+        identify(Fails(), thrown(), bounds=BOUNDS, scene="first")
+
+
+def test_an_answer_that_does_not_fit_says_so() -> None:
+    seen = thrown()
+    answer = identify(Drag(), replace(seen, pos=10 * seen.pos), bounds=BOUNDS)
+    assert "solver does not fit: its rollouts are" in str(answer)
+    assert any("solver does not fit" in line for line in side_by_side({"solver": answer}))
+    assert not identify(Drag(), seen, bounds=BOUNDS).warning
 
 
 def test_refusals() -> None:
@@ -285,10 +343,15 @@ def test_a_search_without_trusted_gradients_goes_on_without(monkeypatch: pytest.
 # --- calibration ---------------------------------------------------------------------------------------------------------------------------
 
 
+NUMBERS = count()
+
+
 def scene(truth: float, certainty: float, error: float) -> Known:
     """Return an answer whose misfit is a parabola."""
     at = np.linspace(0, 60, 241)
-    return Known(truth + error, truth, Profile.of(zip(at, certainty * (at - truth - error) ** 2, strict=True), (0.0, 60.0)))
+    return Known(
+        truth + error, truth, Profile.of(zip(at, certainty * (at - truth - error) ** 2, strict=True), (0.0, 60.0)), f"scene {next(NUMBERS)}"
+    )
 
 
 def uneven(number: int, seed: int) -> list[Known]:
@@ -354,6 +417,16 @@ def test_answers_that_fall_where_true_values_rise_are_not_corrected() -> None:
     assert (found.offset, found.slope) == (0.0, 1.0)
 
 
+def test_bodies_of_a_scene_count_as_one_scene() -> None:
+    known = [replace(own, scene=str(k // 2)) for k, own in enumerate(uneven(16, 0))]
+    with pytest.raises(FewScenesError, match="8 calibration scenes"):
+        calibrated(known)
+    twice = uneven(20, 0)
+    single, double = calibrated(twice), calibrated([*twice, *twice])
+    assert single.num_scenes == double.num_scenes
+    assert single.threshold == pytest.approx(double.threshold)
+
+
 def test_intervals_do_not_depend_on_the_truth_of_their_own_part() -> None:
     known = uneven(40, 0)
     changed = [replace(own, truth=own.truth + 5) if k % 2 else own for k, own in enumerate(known)]
@@ -397,6 +470,11 @@ def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr("gpe_pl.evaluation.identification.results.identify", None)
     assert [*task.run("first", seen, tmp_path)] == [line]
     assert read_answers(tmp_path, "model") == before
+    with pytest.raises(ObservationError, match=r"first_model\.json: is the answer for another motion than that of first"):
+        list(task.run("first", replace(seen, pos=seen.pos + 0.01), tmp_path))
+    known = replace(task, calibrated_on={Observations.of(seen).digest})
+    with pytest.raises(ObservationError, match="first: this motion is one of those that the calibration is from"):
+        list(known.run("first", seen, tmp_path))
     assert "sand.friction_angle | model | none | 1 |" in write_table(tmp_path)
 
 
