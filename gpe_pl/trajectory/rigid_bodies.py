@@ -7,7 +7,8 @@ the same momentum and the same angular momentum, with arms r = x − c, masses m
 
 The new velocity of a node is its displacement over Δt, so both sums also hold for the stored velocities. Without forces, momentum and angular momentum are
 constant over any number of steps. In 2D the second equation reads I sin φ = L Δt. In 3D it is solved by Newton's method for the vector part of the unit
-quaternion of R. A body that should turn by more than ``LARGEST_ANGLE`` in one step turns by that angle.
+quaternion of R. If no rotation by at most ``LARGEST_ANGLE`` has the angular momentum, the body turns by this angle about
+the direction of the angular momentum.
 
 Source: Moser and Veselov 1991, "Discrete versions of some classical integrable systems and factorization of matrix polynomials", Comm. Math. Phys. 139.
 """
@@ -29,6 +30,8 @@ NUM_ITERATIONS = 12
 """Maximum number of Newton steps. Three suffice for turns by 0.1 rad."""
 SMALL = 1e-14
 """Newton's method ends at this change of the quaternion."""
+INSIDE = 1 - 1e-6
+"""Newton's method stays below this fraction of the limit. At the limit itself its slope has no inverse."""
 NO_INERTIA = 1e-12
 """Fraction of the moment of inertia that is added along all axes. Bodies in a row, and single nodes, have none along some."""
 TINY = 1e-300
@@ -118,17 +121,32 @@ def _turned_in_space(arm: Array, weight: Array, way: Array) -> Array:
     q = xp.linalg.solve(inertia, wanted[:, None])[:, 0]
     limit = math.sin(LARGEST_ANGLE / 2)
     for _ in range(NUM_ITERATIONS):
-        q = _at_most(q, limit)
-        scalar, spin = xp.sqrt(1 - xp.sum(q**2)), inertia @ q
-        residual = scalar * spin + _cross(q, spin) - wanted
-        slope = scalar * inertia - spin[:, None] * q[None, :] / scalar + _matrix(q) @ inertia - _matrix(spin)
-        change = xp.linalg.solve(slope, residual[:, None])[:, 0]
+        q = _at_most(q, INSIDE * limit)
+        slope = _slope(q, inertia)
+        change = xp.linalg.solve(slope, (_momentum(q, inertia) - wanted)[:, None])[:, 0]
         q = q - change
         if bool(xp.all(xp.abs(change) < SMALL)):
             break
     q = _at_most(q, limit)
+    missed = xp.sum((_momentum(q, inertia) - wanted) ** 2)
+    if bool(missed > xp.finfo(arm.dtype).eps * xp.sum(wanted**2)):  # no rotation up to the limit has this angular momentum
+        q = wanted * (limit / xp.sqrt(xp.sum(wanted**2)))
     turn = _cross(xp.broadcast_to(q, arm.shape), arm)
     return 2 * (xp.sqrt(1 - xp.sum(q**2)) * turn + _cross(xp.broadcast_to(q, arm.shape), turn))
+
+
+def _momentum(q: Array, inertia: Array) -> Array:
+    """Return half the angular momentum [3] of the rotation with the vector part ``q`` [3], times the frame interval."""
+    xp = array_namespace(q)
+    spin = inertia @ q
+    return xp.sqrt(1 - xp.sum(q**2)) * spin + _cross(q, spin)
+
+
+def _slope(q: Array, inertia: Array) -> Array:
+    """Return the derivative [3, 3] of ``_momentum`` by ``q``."""
+    xp = array_namespace(q)
+    scalar, spin = xp.sqrt(1 - xp.sum(q**2)), inertia @ q
+    return scalar * inertia - spin[:, None] * q[None, :] / scalar + _matrix(q) @ inertia - _matrix(spin)
 
 
 def _at_most(q: Array, limit: float) -> Array:

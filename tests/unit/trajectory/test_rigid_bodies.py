@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,3 +125,20 @@ def test_a_body_is_marked_as_a_whole_or_not_at_all() -> None:
     mask, body = np.array([True, False, True, True, False]), np.array([0, 0, 3, 3, -1])
     np.testing.assert_array_equal(all_of_bodies(mask, body), [False, False, True, True, False])
     assert all_of_bodies(mask, None) is mask
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+@pytest.mark.parametrize("sides", [(1, 1, 1), (1, 0.5, 0.2), (1, 0.1, 0.1)])
+def test_a_body_asked_for_too_large_a_turn_turns_by_90_degrees_about_its_angular_momentum(sides: tuple[float, ...], backend: str) -> None:
+    rng = np.random.default_rng(4)
+    pos = np.stack(np.meshgrid(*(np.linspace(-s, s, 4) for s in sides)), axis=-1).reshape(-1, 3)
+    for _ in range(30):
+        axis = rng.normal(size=3)
+        vel = np.cross(600 * axis / np.linalg.norm(axis), pos)  # 6 rad in one frame
+        asked = np.cross(pos, vel).sum(axis=0)
+        body: Any = [torch.from_numpy(x) if backend == "torch" else x for x in (pos, vel, np.ones(64))]
+        way = np.asarray(rigid_displacement(body[0], body[1], body[2], DT))
+        along = asked / np.linalg.norm(asked)
+        across = pos - np.outer(pos @ along, along)
+        np.testing.assert_allclose(pos + way, pos - across + np.cross(along, pos), atol=1e-9)
+        assert np.cross(pos, way).sum(axis=0) @ asked > 0
