@@ -83,8 +83,8 @@ def test_a_law_sets_model_graph_and_training_together(data: str, model: str, law
     )
 
 
-WITH_LAW = {"elastic_bodies", "fem_stress", "unseen_materials", "mixed_materials", "sand", "smoke"}
-"""Experiments that leave the law of solids on. All others compare models or parts of the network."""
+WITH_LAW = {"elastic_bodies", "fem_stress", "unseen_materials", "mixed_materials", "sand", "smoke", "few_shot_poisson"}
+"""Experiments that leave the law of solids on, or adapt a shipped model that has it. All others compare models or parts of the network."""
 OF_PARTICLES = {"canyon", "scales"}
 """Experiments whose data cannot be solids."""
 
