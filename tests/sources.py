@@ -23,6 +23,14 @@ def motion(num_frames: int = 10, num_nodes: int = 20, dim: int = 2, seed: int = 
     return (rest + 0.05 * np.sin(phase + 0.1 * rate * time)).astype(np.float32)
 
 
+def rigid(pos: np.ndarray, *bodies: slice) -> np.ndarray:
+    """Return positions [frame, node, dim] in which each body, a slice of nodes, keeps its shape of frame 0 and moves with its first node."""
+    pos = pos.copy()
+    for body in bodies:
+        pos[:, body] = pos[:1, body] + (pos[:, body.start] - pos[0, body.start])[:, None]
+    return pos
+
+
 def frames_of(pos: np.ndarray) -> list[bytes]:
     return [np.ascontiguousarray(frame, "<f4").tobytes() for frame in pos]
 

@@ -4,6 +4,7 @@ All of them are exact: the image of a window, with its walls, is a window that t
 
 - A mirror image maps the domain onto itself.
 - A rotation turns walls along with the scene, so the walls of its image are oblique.
+- The vertical is the axis of gravity; without gravity, the axis along which all walls face one way (``trajectory.reflection.level_axes``).
 - A frame of reference that moves (Galilean shift) adds one velocity to everything. Walls that were at rest then move, because friction and contact depend on
   velocities relative to walls. Without moving walls the image would be wrong wherever a wall is near.
 """
@@ -16,8 +17,8 @@ import numpy as np
 
 from gpe_pl.errors import GpeError
 from gpe_pl.trajectory.boundary import BoundaryMotion
-from gpe_pl.trajectory.reflection import Reflection, Rotation
-from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+from gpe_pl.trajectory.reflection import Reflection, Rotation, level_axes
+from gpe_pl.trajectory.trajectory import Trajectory
 
 MIRROR_STREAM, TURN_STREAM, BOOST_STREAM = 1, 2, 3
 """Further components of the seed, which make the draws independent of the noise and of each other."""
@@ -32,9 +33,9 @@ class Augmentation:
     """Images of training windows.
 
     Attributes:
-        mirror: mirror each window at random. Every axis without gravity is mirrored with probability 1/2, independently of the others.
+        mirror: mirror each window at random. Every level axis is mirrored with probability 1/2, independently of the others.
         rotate: turn each window about the vertical by a random angle; in 3D.
-        boost_speed: speed [m/s] up to which a random velocity, along each axis without gravity, is added to the scene and its walls.
+        boost_speed: speed [m/s] up to which a random velocity, along each level axis, is added to the scene and its walls.
     """
 
     mirror: bool = False
@@ -46,16 +47,18 @@ class Augmentation:
         """Whether images differ by more than a reflection."""
         return self.rotate or self.boost_speed > 0
 
-    def check(self, metadata: Metadata) -> None:
-        """Check that scenes have the symmetries.
+    def check(self, trajectory: Trajectory) -> None:
+        """Check that a scene has the symmetries.
 
         Raises:
-            AugmentationError: windows are to be turned in 2D, without one axis of gravity, in a periodic domain, or with nodes that are held along some axes;
+            AugmentationError: windows are to be turned in 2D, without one vertical axis, in a periodic domain, or with nodes that are held along some axes;
                 or moved in a periodic domain.
         """
-        if self.rotate and (metadata.dim != 3 or np.count_nonzero(metadata.gravity) > 1):
+        metadata = trajectory.metadata
+        if self.rotate and (metadata.dim != 3 or len(_level(trajectory)) < 2):
             raise AugmentationError(
-                "training.rotate=true: needs scenes in 3D with gravity along one axis or none; choose training.mirror=true"
+                "training.rotate=true: needs scenes in 3D with gravity along one axis, or without gravity and with walls that face one way along one axis "
+                "at most; choose training.mirror=true"
             )
         if self.rotate and "sliding" in (metadata.loads or ()):
             raise AugmentationError(
@@ -66,25 +69,30 @@ class Augmentation:
                 "training.rotate and training.boost_speed: not in periodic domains, which stay as they are; leave them off"
             )
 
-    def reflection(self, metadata: Metadata, seed: int, sample: int) -> Reflection:
+    def reflection(self, trajectory: Trajectory, seed: int, sample: int) -> Reflection:
         """Return the reflection of a sample."""
+        bounds = trajectory.metadata.bounds
         if not self.mirror:
-            return Reflection.of(metadata.bounds, ())
+            return Reflection.of(bounds, ())
         rng = np.random.default_rng((seed, sample, MIRROR_STREAM))
-        return Reflection.of(metadata.bounds, [axis for axis, pull in enumerate(metadata.gravity) if pull == 0 and rng.random() < 0.5])
+        return Reflection.of(bounds, [axis for axis in _level(trajectory) if rng.random() < 0.5])
 
     def moved(self, trajectory: Trajectory, frame: int, seed: int, sample: int) -> Trajectory:
         """Return a window turned and seen from a moving frame of reference. At ``frame`` this frame coincides with the one at rest."""
-        metadata = trajectory.metadata
+        metadata, level = trajectory.metadata, _level(trajectory)
         if self.rotate:
-            (axis,) = np.flatnonzero(metadata.gravity) if np.any(metadata.gravity) else (2,)
+            axis = next((axis for axis in range(metadata.dim) if axis not in level), metadata.dim - 1)
             angle = np.random.default_rng((seed, sample, TURN_STREAM)).uniform(0, 2 * np.pi)
-            trajectory = Rotation.about(int(axis), angle, [(low + high) / 2 for low, high in metadata.bounds]).trajectory(trajectory)
+            trajectory = Rotation.about(axis, angle, [(low + high) / 2 for low, high in metadata.bounds]).trajectory(trajectory)
         if self.boost_speed > 0:
             velocity = np.random.default_rng((seed, sample, BOOST_STREAM)).uniform(-self.boost_speed, self.boost_speed, metadata.dim)
-            velocity[np.asarray(metadata.gravity) != 0] = 0.0
+            velocity[[axis for axis in range(metadata.dim) if axis not in level]] = 0.0
             trajectory = boosted(trajectory, velocity, frame)
         return trajectory
+
+
+def _level(trajectory: Trajectory) -> list[int]:
+    return level_axes(trajectory.metadata.gravity, trajectory.boundary.normal)
 
 
 def boosted(trajectory: Trajectory, velocity: np.ndarray, frame: int) -> Trajectory:

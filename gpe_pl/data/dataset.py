@@ -366,7 +366,9 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
     ) -> None:
         self.trajectories, self.builder, self.noise, self.stress, self.solver = trajectories, builder, noise, stress, solver
         self.augmentation, self.unroll_steps = augmentation, unroll_steps
-        augmentation.check(builder.metadata)
+        if augmentation.is_beyond_mirror:
+            for stored in trajectories:
+                augmentation.check(stored.window(0, 1))
         self.is_open = any(trajectory.is_open for trajectory in trajectories)
         if self.is_open:
             check_settings(unroll_steps, solver is not None, augmentation != Augmentation())
@@ -439,7 +441,7 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         stored = self.trajectories[number]
         ahead = self.unroll_steps - 1 if is_unroll else 0 if start is None else min(start.num_steps, stored.num_frames - 2 - frame)
         original = stored.window(frame - history, frame + 2 + ahead)
-        reflection = self.augmentation.reflection(original.metadata, self.seed, sample)
+        reflection = self.augmentation.reflection(original, self.seed, sample)
         trajectory = self.augmentation.moved(reflection.trajectory(original), history, self.seed, sample)
         dt = trajectory.metadata.frame_dt
         truth = continued(trajectory)

@@ -70,7 +70,7 @@ def distance_in(trajectories: Iterable[Trajectory], quantile: float) -> float:
 def kept_apart(state: State, distance: float, dt: float) -> State:
     """Return a state whose liquid nodes are hardly nearer to each other than a distance. Velocities change by displacement / ``dt``.
 
-    Nodes that move apart may come too near to others, so a small part of a gap can remain.
+    Nodes of rigid bodies stay where they are. Nodes that move apart may come too near to others, so a small part of a gap can remain.
 
     Args:
         state: state after a step, as tensors.
@@ -80,7 +80,10 @@ def kept_apart(state: State, distance: float, dt: float) -> State:
     Returns:
         The same object if no pair is too near.
     """
-    rows = torch.nonzero(state.node_type == node_code(MATERIAL))[:, 0]
+    is_liquid = state.node_type == node_code(MATERIAL)
+    if state.rigid_body is not None:
+        is_liquid = is_liquid & (state.rigid_body < 0)
+    rows = torch.nonzero(is_liquid)[:, 0]
     start = state.pos[rows]
     pairs = radius_pairs(np.ascontiguousarray(start.detach().cpu().numpy()), MARGIN * distance, state.periodicity)
     i, j = torch.from_numpy(pairs).to(rows.device)

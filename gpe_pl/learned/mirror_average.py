@@ -15,7 +15,7 @@ import torch
 
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.trajectory.boundary import Boundary
-from gpe_pl.trajectory.reflection import Reflection
+from gpe_pl.trajectory.reflection import Reflection, level_axes
 from gpe_pl.trajectory.state import State, Stress
 
 MAX_BOUNDARIES = 64
@@ -56,9 +56,9 @@ class MirrorAverage:
         ]
 
     def _reflections(self, state: State) -> list[Reflection]:
-        """Return the reflections along the axes without gravity, and their products."""
+        """Return the reflections along the level axes, and their products."""
         bounds = state.periodicity.bounds if state.periodicity else self.bounds
-        level = [axis for axis in range(state.dim) if float(state.gravity[axis]) == 0]
+        level = level_axes(state.gravity.tolist(), state.boundary.normal)
         chosen = [[axis for axis, turns in zip(level, which, strict=True) if turns] for which in product((False, True), repeat=len(level))]
         return [Reflection.of(bounds, axes) for axes in chosen[1:]]
 

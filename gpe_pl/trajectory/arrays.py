@@ -190,16 +190,17 @@ def checked_bodies(rigid_body: Any, num_nodes: int) -> np.ndarray:
     """Return the number of the rigid body of each node [node], −1 for none.
 
     Raises:
-        ArrayError: the array is not of integers, has another shape, or has a number below −1.
+        ArrayError: the array is not of integers, has another shape, or has a number below −1 or above 2³¹ − 1.
     """
     array = np.asarray(rigid_body)
     if array.dtype.kind not in "iu" or array.shape != (num_nodes,):
         raise ArrayError(
             f"rigid_body: is {array.dtype}{list(array.shape)}, expected integers [node {num_nodes}], -1 for nodes of no rigid body"
         )
-    if (array < -1).any():
-        node = int((array < -1).argmax())
-        raise ArrayError(f"rigid_body: node {node} is {array[node]}, must be -1 or the number of a body")
+    wrong = (array > np.iinfo(np.int32).max) | ((array < -1) if array.dtype.kind == "i" else False)
+    if wrong.any():
+        node = int(wrong.argmax())
+        raise ArrayError(f"rigid_body: node {node} is {array[node]}, must be -1 or the number of a body, up to {np.iinfo(np.int32).max}")
     return array.astype(np.int32)
 
 

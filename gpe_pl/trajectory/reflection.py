@@ -15,6 +15,25 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 Array = Any
 
+FACES_ALONG = 0.9
+"""A wall faces along an axis if this component of its normal is larger."""
+
+
+def level_axes(gravity: Sequence[float], normal: Array) -> list[int]:
+    """Return the axes along which a scene may be mirrored and moved: those without gravity.
+
+    Without any gravity, an axis along which all walls face one way counts as the vertical and is left out. Data may store no gravity because another force
+    balances it, as in liquids that fall at their terminal velocity; their scenes still have a floor, and no ceiling.
+
+    Args:
+        gravity: gravity [dim] in m/s².
+        normal: unit normals of walls [boundary_node, dim].
+    """
+    if any(float(pull) != 0 for pull in gravity):
+        return [axis for axis, pull in enumerate(gravity) if float(pull) == 0]
+    faces = [(bool((normal[:, axis] > FACES_ALONG).any()), bool((normal[:, axis] < -FACES_ALONG).any())) for axis in range(len(gravity))]
+    return [axis for axis, (up, down) in enumerate(faces) if up == down]
+
 
 class Isometry(Protocol):
     """A map of space that keeps lengths, given by its images of points, vectors and symmetric tensors."""

@@ -7,8 +7,7 @@ the same momentum and the same angular momentum, with arms r = x − c, masses m
 
 The new velocity of a node is its displacement over Δt, so both sums also hold for the stored velocities. Without forces, momentum and angular momentum are
 constant over any number of steps. In 2D the second equation reads I sin φ = L Δt. In 3D it is solved by Newton's method for the vector part of the unit
-quaternion of R. If no rotation by at most ``LARGEST_ANGLE`` has the angular momentum, the body turns by this angle about
-the direction of the angular momentum.
+quaternion of R. If no rotation by at most ``LARGEST_ANGLE`` has the angular momentum, the body gets the largest fraction of it that such a rotation has.
 
 Source: Moser and Veselov 1991, "Discrete versions of some classical integrable systems and factorization of matrix polynomials", Comm. Math. Phys. 139.
 """
@@ -32,6 +31,8 @@ SMALL = 1e-14
 """Newton's method ends at this change of the quaternion."""
 INSIDE = 1 - 1e-6
 """Newton's method stays below this fraction of the limit. At the limit itself its slope has no inverse."""
+NUM_HALVINGS = 20
+"""Number of halvings of the interval in which the largest possible fraction of an angular momentum is searched for."""
 NO_INERTIA = 1e-12
 """Fraction of the moment of inertia that is added along all axes. Bodies in a row, and single nodes, have none along some."""
 TINY = 1e-300
@@ -118,21 +119,36 @@ def _turned_in_space(arm: Array, weight: Array, way: Array) -> Array:
     trace = xp.sum(weight * arm**2) + TINY
     inertia = (1 + NO_INERTIA) * trace * one - second
     wanted = xp.sum(weight * _cross(arm, way), axis=0) / 2
-    q = xp.linalg.solve(inertia, wanted[:, None])[:, 0]
+    q, is_solved = _solved(xp.linalg.solve(inertia, wanted[:, None])[:, 0], wanted, inertia)
+    if not is_solved:  # no rotation up to the limit has this angular momentum
+        q, low, high = 0 * wanted, 0.0, 1.0
+        for _ in range(NUM_HALVINGS):
+            middle = (low + high) / 2
+            found, is_solved = _solved(q if low else middle * xp.linalg.solve(inertia, wanted[:, None])[:, 0], middle * wanted, inertia)
+            if is_solved:
+                q, low = found, middle
+            else:
+                high = middle
+    turn = _cross(xp.broadcast_to(q, arm.shape), arm)
+    return 2 * (xp.sqrt(1 - xp.sum(q**2)) * turn + _cross(xp.broadcast_to(q, arm.shape), turn))
+
+
+def _solved(q: Array, wanted: Array, inertia: Array) -> tuple[Array, bool]:
+    """Return the vector part [3] of the rotation up to the limit with half an angular momentum [3] times the frame interval, and whether there is one.
+
+    Newton's method starts at ``q`` [3].
+    """
+    xp = array_namespace(q)
     limit = math.sin(LARGEST_ANGLE / 2)
     for _ in range(NUM_ITERATIONS):
         q = _at_most(q, INSIDE * limit)
-        slope = _slope(q, inertia)
-        change = xp.linalg.solve(slope, (_momentum(q, inertia) - wanted)[:, None])[:, 0]
+        change = xp.linalg.solve(_slope(q, inertia), (_momentum(q, inertia) - wanted)[:, None])[:, 0]
         q = q - change
         if bool(xp.all(xp.abs(change) < SMALL)):
             break
     q = _at_most(q, limit)
     missed = xp.sum((_momentum(q, inertia) - wanted) ** 2)
-    if bool(missed > xp.finfo(arm.dtype).eps * xp.sum(wanted**2)):  # no rotation up to the limit has this angular momentum
-        q = wanted * (limit / xp.sqrt(xp.sum(wanted**2)))
-    turn = _cross(xp.broadcast_to(q, arm.shape), arm)
-    return 2 * (xp.sqrt(1 - xp.sum(q**2)) * turn + _cross(xp.broadcast_to(q, arm.shape), turn))
+    return q, bool(missed <= xp.finfo(q.dtype).eps * xp.sum(wanted**2))
 
 
 def _momentum(q: Array, inertia: Array) -> Array:

@@ -54,6 +54,14 @@ def test_a_pair_moves_apart_along_its_line_by_masses() -> None:
     torch.testing.assert_close(after.pos, pos + way, rtol=0, atol=1e-12)
 
 
+def test_rigid_bodies_of_a_liquid_keep_their_shape() -> None:
+    state = liquid()
+    body = torch.where(torch.arange(len(state.pos)) < 12, 0, -1)
+    after = kept_apart(replace(state, rigid_body=body), DISTANCE, DT)
+    assert torch.equal(after.pos[:12], state.pos[:12])
+    assert not torch.equal(after.pos[12:], state.pos[12:])
+
+
 def test_nodes_apart_and_other_materials_stay() -> None:
     state = liquid()
     assert kept_apart(state, 0.5 * float(nearest(state).min()), DT) is state

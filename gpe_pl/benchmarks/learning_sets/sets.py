@@ -26,6 +26,8 @@ class LearningSet:
         source: its folder in the user's folder.
         origin: where to get it.
         format: format of ``convert``.
+        num_trajectories, num_frames, materials: number of trajectories, number of frames of each, and materials after the import. Figures on other files would
+            not be comparable.
         start: frame of the stored trajectory at which rollouts start.
         leave_out: trajectories that are the test one after the other, by number; with none, there is one split.
         splits: numbers of the trajectories of each split; None takes the published split.
@@ -37,6 +39,9 @@ class LearningSet:
     source: str
     origin: str
     format: Format
+    num_trajectories: int
+    num_frames: int
+    materials: frozenset[str]
     start: int
     leave_out: tuple[int, ...] = ()
     splits: Mapping[str, list[int]] | None = None
@@ -56,6 +61,9 @@ SETS: dict[SetName, LearningSet] = {
         "database_beam",
         "data/database_beam of github.com/quercushernandez/ThermodynamicsGNN",
         "thermognn",
+        num_trajectories=52,
+        num_frames=22,
+        materials=frozenset({"elastomer"}),
         start=1,  # frame 0 is the one that the importer puts before the first
         is_relative=True,
         published={POSITION: 4.1e-3, VELOCITY: 1.7e-2, STRESS: 9.5e-2},
@@ -65,22 +73,42 @@ SETS: dict[SetName, LearningSet] = {
         "data_FluidFall",
         "data/data_FluidFall of github.com/YunzhuLi/DPI-Net",
         "dpinet",
+        num_trajectories=5,
+        num_frames=121,
+        materials=frozenset({"fluid"}),
         start=5,
         leave_out=(0, 1, 2, 3, 4),
         published={FULL: 0.0415, ONE_STEP: 5.6e-4},
         note="the published weights of DPI-Net on the same rollouts, which were not in their training",
     ),
     "boxbath": LearningSet(
-        "data_BoxBath", "data/data_BoxBath of github.com/YunzhuLi/DPI-Net", "dpinet", start=1, leave_out=(0, 1, 2, 3, 4)
+        "data_BoxBath",
+        "data/data_BoxBath of github.com/YunzhuLi/DPI-Net",
+        "dpinet",
+        num_trajectories=5,
+        num_frames=151,
+        materials=frozenset({"fluid", "solid"}),
+        start=1,
+        leave_out=(0, 1, 2, 3, 4),
     ),
     "rigidfall": LearningSet(
         "data_RigidFall/demo",
         "data/data_RigidFall of github.com/YunzhuLi/VGPL-Dynamics-Prior",
         "dpinet",
+        num_trajectories=10,
+        num_frames=151,
+        materials=frozenset({"solid"}),
         start=3,
         splits={"val": [7], "test": [8, 9]},
     ),
     "ricegrip": LearningSet(
-        "data_RiceGrip", "data/data_RiceGrip of github.com/YunzhuLi/DPI-Net", "dpinet", start=1, splits={"val": [3], "test": [4]}
+        "data_RiceGrip",
+        "data/data_RiceGrip of github.com/YunzhuLi/DPI-Net",
+        "dpinet",
+        num_trajectories=5,
+        num_frames=41,
+        materials=frozenset({"snow"}),
+        start=1,
+        splits={"val": [3], "test": [4]},
     ),
 }

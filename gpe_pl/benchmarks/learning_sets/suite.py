@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
+from shutil import rmtree
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,9 +20,10 @@ import torch
 from pydantic import Field
 
 from gpe_pl.benchmarks.learning_sets.measures import MODEL, measured, pooled, trivial
-from gpe_pl.benchmarks.learning_sets.sets import QUANTITIES, RIGIDITY, SETS, SetName
+from gpe_pl.benchmarks.learning_sets.sets import QUANTITIES, RIGIDITY, SETS, LearningSet, SetName
 from gpe_pl.data.importers import ImportSettings, import_dataset
 from gpe_pl.data.importers.assemble import FOLDER
+from gpe_pl.data.importers.report import Report
 from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
@@ -31,11 +33,13 @@ RESUMES = True
 """``run`` takes a folder and continues where an earlier run was stopped."""
 
 MEASURED_FILE = "measured.json"
+SOURCE_FILE = "source.sha256"
+"""File beside imported data with the digest of the files that they were made of."""
 HEADER = ["data set", "quantity", "published", "trivial baseline", "model", "splits", "seeds", "core-minutes"]
 
 
 class LearningSetError(GpeError, RuntimeError):
-    """Raised when a training fails; the message names its command."""
+    """Raised when files are not those of a data set, or when a training fails; the message names folder or command."""
 
 
 @dataclass(frozen=True)
@@ -66,26 +70,80 @@ def run(settings: Settings, folder: Path) -> tuple[list[dict[str, Any]], str]:
 
     Raises:
         ImportFailure: files of a data set cannot be read.
-        LearningSetError: a training failed.
+        LearningSetError: the files are not those of the data set, or others than an earlier run of this folder imported; or a training failed.
     """
     torch.set_num_threads(settings.num_threads)
     source = Path(settings.folder).expanduser()
     for name in settings.only:
         if (source / SETS[name].source).is_dir():
+            digest = digest_of(source / SETS[name].source)
             for label, splits in list(SETS[name].parts().items())[: settings.num_splits]:
                 for seed in settings.seeds:
-                    _trained(name, label, splits, seed, source, folder, settings)
+                    dataset = imported(name, label, splits, source, folder, digest)
+                    _trained(name, label, dataset, seed, folder, settings)
     records = records_in(folder)
     return records, report(records, source)
 
 
-def _trained(name: SetName, label: str, splits: Mapping[str, Any], seed: int, source: Path, folder: Path, settings: Settings) -> None:
-    """Import, train and measure one split with one seed, as far as it has not been done."""
-    learning_set = SETS[name]
-    dataset = "_".join([name, *label.split()])
-    root = folder / "data" / dataset / FOLDER
-    if not root.is_dir():
-        import_dataset(folder / "data", ImportSettings(learning_set.format, str(source / learning_set.source), name=dataset, **splits))
+def digest_of(source: Path) -> str:
+    """Return a digest of the names and contents of all files in a folder."""
+    found = sha256()
+    for path in sorted(path for path in source.rglob("*") if path.is_file()):
+        found.update(f"{path.relative_to(source).as_posix()}\0{sha256(path.read_bytes()).hexdigest()}\n".encode())
+    return found.hexdigest()
+
+
+def imported(name: SetName, label: str, splits: Mapping[str, Any], source: Path, folder: Path, digest: str) -> str:
+    """Import one split, unless an earlier run has done so, and return the name of the data.
+
+    Args:
+        name: name of the data set.
+        label: label of the split.
+        splits: settings of ``convert`` for the split.
+        source: folder of all data sets.
+        folder: folder of the suite.
+        digest: digest of the files (``digest_of``).
+
+    Raises:
+        ImportFailure: files cannot be read.
+        LearningSetError: files are damaged, missing, or of another data set; or others than those that an earlier run imported.
+    """
+    learning_set, dataset = SETS[name], "_".join([name, *label.split()])
+    files, root = source / learning_set.source, folder / "data" / dataset
+    stored = root / SOURCE_FILE
+    if (root / FOLDER).is_dir():
+        if not stored.is_file() or stored.read_text(encoding="utf-8").strip() != digest:
+            raise LearningSetError(
+                f"{files}: holds other files than those that {root} was made of; choose another folder with hydra.run.dir=…"
+            )
+        return dataset
+    replace_text(stored, digest + "\n")
+    report = import_dataset(folder / "data", ImportSettings(learning_set.format, str(files), name=dataset, **splits))
+    if fault := _fault(report, learning_set):
+        rmtree(root)
+        raise LearningSetError(f"{files}: {fault}; its figures would not be comparable. Get the files of {learning_set.origin}")
+    return dataset
+
+
+def _fault(report: Report, learning_set: LearningSet) -> str:
+    """Return what shows that imported data are not the data set as it was published; empty if nothing does."""
+    if report.refusals:
+        return f"{len(report.refusals)} trajectories cannot be used: {report.refusals[0]}"
+    count = sum(split.trajectories for split in report.splits.values())
+    lengths = {length for split in report.splits.values() for length in split.frames}
+    for what, found, expected in (
+        ("trajectories", count, learning_set.num_trajectories),
+        ("frames", ", ".join(map(str, sorted(lengths))), str(learning_set.num_frames)),
+        ("as materials", ", ".join(sorted(report.materials)), ", ".join(sorted(learning_set.materials))),
+    ):
+        if found != expected:
+            return f"has {found} {what}, the data set has {expected}"
+    return ""
+
+
+def _trained(name: SetName, label: str, dataset: str, seed: int, folder: Path, settings: Settings) -> None:
+    """Train and measure one split with one seed, as far as it has not been done."""
+    learning_set, root = SETS[name], folder / "data" / dataset / FOLDER
     run_name = f"{dataset}_seed_{seed}"
     overrides = [*settings.training.get(name, []), f"training.budget_minutes={settings.minutes:g}"]
     shared = f"reuse={dataset}"  # seeds share a measured step time, which is stored there, so they have equal numbers of steps

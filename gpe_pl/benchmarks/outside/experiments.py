@@ -116,15 +116,25 @@ def measured_fronts(path: Path) -> list[Curve]:
     """Return the measured fronts of a file with the columns ``series``, ``T`` and ``Z``.
 
     Raises:
-        OutsideError: the file has other columns, or a value is not a number.
+        OutsideError: the file is not UTF-8, has other columns or no rows, or a value is no finite number.
     """
     found: dict[str, list[tuple[float, float]]] = {}
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            for row in csv.DictReader(file):
-                found.setdefault(row["series"], []).append((float(row["T"]), float(row["Z"])))
-    except (KeyError, ValueError, TypeError) as error:
-        raise OutsideError(f"{path}: expected the columns series, T and Z with numbers ({error})") from None
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file)
+            if lacking := {"series", "T", "Z"} - {*(rows.fieldnames or ())}:
+                raise OutsideError(f"{path}: has no column {min(lacking)}; expected the columns series, T and Z")
+            for row in rows:
+                point = float(row["T"]), float(row["Z"])
+                if not np.isfinite(point).all():
+                    raise OutsideError(f"{path}: line {rows.line_num}: T and Z are {point[0]} and {point[1]}, must be finite numbers")
+                found.setdefault(row["series"], []).append(point)
+    except UnicodeDecodeError as error:
+        raise OutsideError(f"{path}: is not UTF-8 ({error.reason} at byte {error.start})") from None
+    except (ValueError, TypeError) as error:
+        raise OutsideError(f"{path}: line {rows.line_num}: T and Z must be numbers ({error})") from None
+    if not found:
+        raise OutsideError(f"{path}: has no rows")
     return [Curve(series, *np.array(sorted(points)).T) for series, points in found.items()]
 
 

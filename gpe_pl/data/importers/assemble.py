@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -14,25 +13,25 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.data.checksum import split_checksum
-from gpe_pl.data.free_flight import FreeFlight, joined, vector
+from gpe_pl.data.free_flight import joined, vector
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
-from gpe_pl.data.importers.sampled import degrees_of, free_flight_of, speed_and_acceleration
+from gpe_pl.data.importers.sampled import degrees_of, speed_and_acceleration
 from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
 from gpe_pl.data.importers.splits import arranged
-from gpe_pl.data.position_rounding import ROUNDING_FRACTION, MotionSummary, better_origin, motion_of, rounding_fault
+from gpe_pl.data.importers.survey import NUM_SAMPLED, SPACING_RATIO, Survey
+from gpe_pl.data.position_rounding import ROUNDING_FRACTION, better_origin, rounding_fault
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.errors import GpeError
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import free_bytes, replacing
 from gpe_pl.files.names import NameRefused, data_name
 from gpe_pl.geometry.periodicity import PeriodicityError
-from gpe_pl.schema import HISTORY, LOADS, MATERIALS, NODE_TYPES, SPLITS, ParameterGroup, node_code, param_names, stored_parameters
+from gpe_pl.schema import HISTORY, LOADS, MATERIALS, SPLITS, ParameterGroup, node_code, param_names, stored_parameters
 from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
-from gpe_pl.trajectory.arrays import ArrayError, nearest_distances
-from gpe_pl.trajectory.store import iter_trajectories, stored_arrays, write_shard
-from gpe_pl.trajectory.trajectory import Metadata, Trajectory
-from gpe_pl.trajectory.values import faults, size_conflicts
+from gpe_pl.trajectory.arrays import ArrayError
+from gpe_pl.trajectory.store import iter_trajectories, write_shard
+from gpe_pl.trajectory.trajectory import Trajectory
 
 FOLDER = "imported"
 """Folder of imported data in the folder of a data set. Generated data have folders named by their size."""
@@ -41,8 +40,6 @@ CONTACT_SHEET_FILE = "contact_sheet.png"
 VERSION = "1"
 """Version of the conversion, stored as ``solver_version``."""
 TRAJECTORIES_PER_SHARD = 8
-NUM_SAMPLED = 8
-"""Number of trajectories from which spacing, neighbours and free flight are measured. Training trajectories come first."""
 ENOUGH_GROUPS = 20
 """Number of groups in free flight, over all examined frames, from which the gravity of a source is measured if it does not state one."""
 NUM_SHOWN = 4
@@ -50,18 +47,10 @@ NUM_SHOWN = 4
 
 FEWEST_NEIGHBOURS, MOST_NEIGHBOURS = 3.0, 60.0
 """A warning is given for a mean number of neighbours outside this range."""
-SPACING_RATIO = 3.0
-"""A warning is given if the spacing and the distance of nearest nodes differ by more than this factor."""
-LONG_ENOUGH = HISTORY + 2
-"""Number of frames that a model needs with the default history."""
 SHORT = 10 * HISTORY
 """With fewer frames, the report says how to use more of them."""
-COINCIDENCE = 1e-3
-"""Nodes closer than this fraction of the median distance to the nearest node, in the first frame, count as at one place."""
 VELOCITY_RATIO = 1.25
 """A warning is given if displacements and velocities of a source differ by more than this factor."""
-FRAMES_COMPARED = 200
-"""Number of first frames in which displacements and velocities are compared."""
 TYPED = ("gns", "lagrangebench", "meshgraphnets", "calculix", "meshio")
 """Formats with node types."""
 
@@ -175,47 +164,6 @@ def _check_free(folder: Path) -> None:
         raise ImportFailure(f"{folder}: exists already, and imported data are never overwritten; delete it, or choose another name=…")
 
 
-@dataclass
-class _Survey:
-    """Facts collected in the first pass.
-
-    Attributes:
-        good: usable trajectories by split.
-        materials: materials of all trajectories.
-        columns: names of the parameters of all trajectories.
-        stressed: materials with a stress in any trajectory.
-        loads: loads that any trajectory has.
-        bounds: bounds of each trajectory, ``(low, high)`` per axis [m].
-        spacings, distances, radii: spacing, median distance to the nearest node, and connectivity radius of each sampled trajectory [m].
-        velocity_ratios: mean displacement over mean velocity × frame interval, of each sampled trajectory.
-        scenes: names of trajectories by the digest of their positions.
-        motions: split, name and motion of each trajectory.
-        assumes_gravity: for each trajectory, whether its gravity is only assumed to be the usual one of the format.
-        suspects: warnings about trajectories.
-        num_bytes: size of all arrays.
-        flights: of each sampled trajectory, whether its gravity is assumed, and its groups in free flight.
-        common: frame interval [s], dimension and periodic axes of all trajectories.
-    """
-
-    good: dict[str, list[Item]] = field(default_factory=dict)
-    materials: set[str] = field(default_factory=set)
-    columns: set[str] = field(default_factory=set)
-    stressed: set[str] = field(default_factory=set)
-    loads: set[str] = field(default_factory=set)
-    bounds: list[tuple[tuple[float, float], ...]] = field(default_factory=list)
-    spacings: list[float] = field(default_factory=list)
-    distances: list[float] = field(default_factory=list)
-    radii: list[float] = field(default_factory=list)
-    velocity_ratios: list[float] = field(default_factory=list)
-    scenes: dict[bytes, str] = field(default_factory=dict)
-    motions: list[tuple[str, str, MotionSummary]] = field(default_factory=list)
-    assumes_gravity: list[bool] = field(default_factory=list)
-    suspects: list[Event] = field(default_factory=list)
-    num_bytes: int = 0
-    flights: list[tuple[bool, FreeFlight]] = field(default_factory=list)
-    common: tuple[float, int, tuple[bool, ...]] | None = None
-
-
 class _Conversion:
     """The conversion of one data set."""
 
@@ -226,7 +174,7 @@ class _Conversion:
         self.source = replace(source, splits={split: source.splits[split] for split in SPLITS if split in source.splits})
         self.facts, self.holdout, self.folder, self.about = source.facts, holdout, folder, about
         self.report = Report(name, about["format"], about["source"], str(folder), warnings=list(source.warnings))
-        self.survey = _Survey()
+        self.survey = Survey()
         self.trained: dict[str, tuple[float, float]] = {}
         self.origin = np.zeros(0)
         self.on_progress, self.num_read = on_progress, 0
@@ -265,13 +213,11 @@ class _Conversion:
             for item in items:
                 try:
                     loaded = self._load(item)
-                    self._accept(split, item.name, loaded)
+                    self.survey.add(split, item, loaded, self.facts)
                 except (Refusal, ArrayError) as refusal:
                     self.report.refusals.append(Event(split, item.name, refusal.frame, str(refusal)))
                     continue
-                self.survey.good.setdefault(split, []).append(item)
                 self.report.repairs += [Event(split, item.name, repair.frame, repair.what) for repair in loaded.repairs]
-                self.survey.suspects += [Event(split, item.name, -1, warning) for warning in loaded.warnings]
                 self.report.notes += [note for note in loaded.notes if note not in self.report.notes]
         self.report.notes = [*self.facts.notes, *self.report.notes]
 
@@ -287,54 +233,6 @@ class _Conversion:
             raise
         except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:  # unforeseen damage
             raise Refusal(f"cannot be read ({type(error).__name__}: {error})") from error
-
-    def _accept(self, split: str, name: str, loaded: Loaded) -> None:
-        """Add a trajectory to the survey; raises ``Refusal`` if it is invalid or does not fit the others."""
-        survey, trajectory = self.survey, loaded.trajectory
-        m, where = trajectory.metadata, f"{split}, {name}"
-        arrays = stored_arrays(trajectory)
-        for fault in _faults(m, arrays):
-            raise Refusal(fault)
-        common = (m.frame_dt, m.dim, m.periodic)
-        if survey.common is None:
-            survey.common = common
-        if common != survey.common:
-            raise Refusal(
-                f"frame_dt, dimension and periodic axes are {common}, of the trajectories before {survey.common}; a data set has the same in all of them"
-            )
-        if not np.any(trajectory.pos != trajectory.pos[:1]):
-            raise Refusal("nothing moves")
-        digest = hashlib.sha256(trajectory.pos.tobytes()).digest()
-        if survey.scenes.setdefault(digest, where) != where:
-            raise Refusal(f"has exactly the positions of {survey.scenes[digest]}: the same scene twice")
-        survey.motions.append((split, name, motion_of(m, trajectory.pos)))
-        survey.assumes_gravity.append(loaded.assumes_gravity)
-        if trajectory.num_frames < LONG_ENOUGH:
-            what = f"has {trajectory.num_frames} frames; models leave it out unless graph.history is below the default, which needs {LONG_ENOUGH}"
-            survey.suspects.append(Event(split, name, -1, what))
-        nearest = nearest_distances(trajectory.pos[0].astype(np.float64), m.periodicity)
-        at_one_place = np.flatnonzero((nearest == 0) | (nearest < COINCIDENCE * np.median(nearest)))
-        if len(at_one_place):
-            what = f"{len(at_one_place)} nodes are at the place of another node, the first is node {at_one_place[0]}: do bodies overlap?"
-            survey.suspects.append(Event(split, name, 0, what))
-        survey.materials |= set(m.materials)
-        survey.columns |= set(m.param_names)
-        survey.loads |= set(m.loads or ())
-        survey.stressed |= set(m.with_stress if trajectory.stress is not None else ())
-        survey.num_bytes += sum(array.nbytes for array in arrays.values())
-        survey.bounds.append(m.bounds)
-        if len(survey.flights) < NUM_SAMPLED:
-            survey.flights.append((loaded.assumes_gravity, free_flight_of(trajectory, self.facts)))
-        if len(survey.spacings) < NUM_SAMPLED:
-            survey.spacings.append(m.spacing)
-            survey.distances.append(float(np.median(nearest)))
-            survey.radii.append(m.connectivity_radius)
-            first = trajectory.frames(0, FRAMES_COMPARED)
-            step = np.linalg.norm(m.periodicity.shortest(np.diff(first.pos.astype(np.float64), axis=0)), axis=-1).mean()
-            speed = np.linalg.norm(first.vel.astype(np.float64), axis=-1)
-            speed = (0.5 * (speed[1:] + speed[:-1])).mean()
-            if speed > 0:
-                survey.velocity_ratios.append(float(step / (speed * m.frame_dt)))
 
     def _decide(self) -> None:
         """Choose values that the source does not state, and splits that it does not have."""
@@ -363,7 +261,7 @@ class _Conversion:
             every = np.array(survey.bounds)
             bounds = tuple(zip(every[..., 0].min(axis=0).tolist(), every[..., 1].max(axis=0).tolist(), strict=True))
             report.notes.append("bounds enclose the bounds of all trajectories (given values, else the extremes of positions; bounds=…)")
-        distance = float(np.median(survey.distances))
+        distance = float(np.median([nearest for _, _, nearest in survey.nearest]))
         if np.isfinite(distance) and not distance / SPACING_RATIO < spacing < distance * SPACING_RATIO:
             report.warnings.append(
                 f"spacing is stored as {spacing:.4g} m, but nodes are {distance:.4g} m from the nearest one (median of first frames): spacing=… or bounds=… "
@@ -373,6 +271,7 @@ class _Conversion:
         self._compare_gravity(dim)
         self._compare_with_rounding()
         self._look_for_jumps(radius)
+        survey.look_for_outliers()
         self._hold_out()
         report.dim, report.frame_dt, report.periodic = dim, frame_dt, list(periodic)
         report.spacing, report.connectivity_radius, report.origin = spacing, radius, self.origin.tolist()
@@ -387,7 +286,8 @@ class _Conversion:
 
         If gravity is only assumed, and at least ``ENOUGH_GROUPS`` groups agree on another acceleration, that acceleration replaces it.
         """
-        report, flights, usual = self.report, self.survey.flights, self.facts.usual_gravity
+        report, usual = self.report, self.facts.usual_gravity
+        flights = [(f.assumed, f.free) for f in self.survey.flights]
         if any(self.survey.assumes_gravity) and usual is not None:
             known = f"gravity is not in the source; {vector(usual[:dim])} is the format's usual one"
             flight = joined((f for assumed, f in flights if assumed), dim)
@@ -421,6 +321,8 @@ class _Conversion:
                 f"gravity is stored as {stored}, but {flight.num_free} groups in free flight agree on {vector(flight.typical)}: "
                 "gravity=[…], frame_dt=… or the unit of length may be wrong"
             )
+        else:
+            self.survey.look_for_wrong_gravity(None if usual is None else (self.facts.usual_gravity or usual)[:dim], dim)
 
     def _compare_with_rounding(self) -> None:
         """Choose the origin of stored positions (``better_origin``), and warn of trajectories whose rounding error is still large."""
@@ -452,8 +354,17 @@ class _Conversion:
                 self.survey.suspects.append(Event(split, name, motion.frame, f"{what}: a fault of the source, or too few frames"))
 
     def _hold_out(self) -> None:
-        """Take missing ``val`` and ``test`` splits from the end of the training trajectories."""
+        """Take ``val`` and ``test`` from the end of the training trajectories if the source does not have them.
+
+        Raises:
+            ImportFailure: the source has such a split, and none of its trajectories can be used.
+        """
         good, report = self.survey.good, self.report
+        if unusable := [split for split in ("val", "test") if self.source.splits.get(split) and not good.get(split)]:
+            refused = next(event for event in report.refusals if event.split == unusable[0])
+            raise ImportFailure(
+                f"{report.source}: no trajectory of {unusable[0]} can be used: {refused}; repair or remove it, or choose other trajectories with splits=…"
+            )
         train = good.get("train", [])
         missing = [split for split in ("val", "test") if not good.get(split)]
         count = max(1, round(self.holdout * len(train)))
@@ -463,7 +374,7 @@ class _Conversion:
                 moved = {item.name for item in good[split]}
                 for events in (report.repairs, self.survey.suspects):
                     events[:] = [replace(e, split=split) if e.split == "train" and e.trajectory in moved else e for e in events]
-                report.notes.append(f"the source has no usable {split}: the last {count} training trajectories were taken")
+                report.notes.append(f"the source has no {split}: the last {count} training trajectories were taken")
         elif missing:
             report.warnings.append(
                 f"there is no split {' and no split '.join(missing)}; fit needs train, val and test, or three trajectories of train to take them from"
@@ -589,10 +500,3 @@ def _united(span: tuple[float, float] | None, values: np.ndarray) -> tuple[float
     """Return the smallest and largest value, those of an earlier span included."""
     low, high = span or (np.inf, -np.inf)
     return min(low, float(values.min())), max(high, float(values.max()))
-
-
-def _faults(m: Metadata, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
-    """Yield the reasons why the store would refuse the metadata or arrays of a trajectory."""
-    yield from (f"{key} {violation}" for key, violation in m.violations())
-    yield from size_conflicts(arrays, m.dim, len(m.param_names))
-    yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))

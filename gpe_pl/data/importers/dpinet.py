@@ -20,6 +20,8 @@ Source: Li et al. 2019 and Li et al. 2020, and the layout of the data of github.
 from __future__ import annotations
 
 import re
+from collections import Counter
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -60,6 +62,7 @@ NUM_WALLS, NUM_GRIPPERS, NUM_GROUNDS = 5, 2, 1
 """Numbers of bodies in ``shape_quats`` of FluidShake, RiceGrip and RigidFall."""
 SIDES = {"bath": ("x_low", "x_high", "y_low", "z_low", "z_high"), "shake": ()}
 """Walls at the extremes of all positions, by environment. All others have the ground only."""
+NAMES = {"fall": "FluidFall", "bath": "BoxBath", "shake": "FluidShake", "grip": "RiceGrip", "rigid": "RigidFall"}
 MAX_CUBES = 100
 
 
@@ -75,16 +78,21 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     if not folders:
         raise ImportFailure(f"{path}: {'no such folder' if not path.exists() else 'holds no folder train or valid, and no rollouts'}")
     rollouts = {split: _numbered(folder, "") for split, folder in folders.items()}
-    first = next((rollout for found in rollouts.values() for rollout in found), None)
-    if first is None:
+    if not any(rollouts.values()):
         raise ImportFailure(f"{path}: train and valid hold no rollouts, which are folders with numbers as names")
-    sides = SIDES.get(_environment(first), ("y_low",))
-    walls = f"walls {', '.join(sides)} at the extremes of all positions, with friction {GROUND_FRICTION:g}: neither is in the source"
+    environments = {rollout: _environment(rollout) for found in rollouts.values() for rollout in found}
+    known = Counter(environment for environment in environments.values() if environment is not None)
+    usual = known.most_common(1)[0][0] if known else "fall"
+    sides = SIDES.get(usual, ("y_low",))
+    walls = f"walls {', '.join(sides)} at the extremes of all positions, the ground at most at y = 0, friction {GROUND_FRICTION:g}: none is in the source"
     notes = [*([walls] if sides else []), "frame_dt = 1/60 s is the format's, not in the files"]
     facts = Facts(FRAME_DT, usual_gravity=GRAVITY, walls=dict.fromkeys(sides, GROUND_FRICTION), notes=tuple(notes)).overridden(settings)
     return Source(
         facts,
-        {split: [Item(f"{r.parent.name}/{r.name}", partial(_load, r)) for r in found] for split, found in rollouts.items()},
+        {
+            split: [Item(f"{r.parent.name}/{r.name}", partial(_load, r, environments[r], usual)) for r in found]
+            for split, found in rollouts.items()
+        },
         warnings,
     )
 
@@ -95,22 +103,21 @@ def _numbered(folder: Path, ending: str) -> list[Path]:
     return sorted(found, key=lambda p: natural(p.name))
 
 
-def _environment(rollout: Path) -> str:
-    """Return ``fall``, ``bath``, ``shake``, ``grip`` or ``rigid``; ``fall`` also for a rollout that cannot be read."""
-    files = _numbered(rollout, ".h5")
-    if not files:
-        return "fall"
-    try:
-        with hdf5.opened(files[0]) as file:
-            if is_named(file, "shape_quats"):
-                count = len(hdf5.array(file, "shape_quats", "body, component", "f"))
-                return {NUM_WALLS: "shake", NUM_GRIPPERS: "grip", NUM_GROUNDS: "rigid"}.get(count, "fall")
-            return "bath" if is_named(file, "clusters") else "fall"
-    except Refusal:
-        return "fall"
+def _environment(rollout: Path) -> str | None:
+    """Return ``fall``, ``bath``, ``shake``, ``grip`` or ``rigid``, as the first file tells that can be read; None if no file can."""
+    for path in _numbered(rollout, ".h5"):
+        try:
+            with hdf5.opened(path) as file:
+                if is_named(file, "shape_quats"):
+                    count = len(hdf5.array(file, "shape_quats", "body, component", "f"))
+                    return {NUM_WALLS: "shake", NUM_GRIPPERS: "grip", NUM_GROUNDS: "rigid"}.get(count, "fall")
+                return "bath" if is_named(file, "clusters") else "fall"
+        except Refusal:
+            continue
+    return None
 
 
-def _load(rollout: Path, facts: Facts) -> Loaded:
+def _load(rollout: Path, environment: str | None, usual: str, facts: Facts) -> Loaded:
     files = _numbered(rollout, ".h5")
     wrong = next((k for k, file in enumerate(files) if int(file.stem) != k), None)
     if not files or wrong is not None:
@@ -139,7 +146,10 @@ def _load(rollout: Path, facts: Facts) -> Loaded:
     assert pos is not None
     if vel is not None and vel.shape != pos.shape:
         raise Refusal(f"velocities is {list(vel.shape[1:])}, expected {list(pos.shape[1:])}")
-    return build(_nodes(pos, vel, quats, scene, has_clusters), facts)
+    nodes = _nodes(pos, vel, quats, scene, has_clusters)
+    if environment != usual:
+        raise Refusal(f"is of {NAMES[environment or 'fall']}, most rollouts are of {NAMES[usual]}; put it into a folder of its own")
+    return build(replace(nodes, ground=0.0), facts)
 
 
 def _nodes(pos: np.ndarray, vel: np.ndarray | None, quats: np.ndarray | None, scene: np.ndarray, has_clusters: bool) -> Nodes:

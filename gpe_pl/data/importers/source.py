@@ -239,6 +239,7 @@ class Nodes:
         mass: mass of each node [node], or of all, in kg.
         gravity: gravity [dim] in m/s², if the source has it per trajectory.
         parameters: parameters by material: values of the first one, or several by name. A parameter has a value per node [node] or one for all.
+        ground: height of the ground [m], where the bounds along y begin if no node is lower; None takes the lowest node.
         walls: positions and normals [boundary_node, dim] of additional boundary nodes.
         cells: cells of a mesh by kind [cell, corner].
         rest_pos: rest positions of a mesh [node, dim] in m.
@@ -257,6 +258,7 @@ class Nodes:
     mass: Any = 1.0
     gravity: tuple[float, ...] | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    ground: float | None = None
     walls: tuple[np.ndarray, np.ndarray] | None = None
     cells: Mapping[str, np.ndarray] | None = None
     rest_pos: np.ndarray | None = None
@@ -310,27 +312,32 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
     gravity = facts.gravity if facts.gravity is not None or nodes.gravity is None else nodes.gravity[: pos.shape[2]]
     assumes_gravity = gravity is None and facts.usual_gravity is not None
     boundary, wall_repairs, wall_notes = _boundary(nodes, pos, facts)
+    trajectory = Trajectory.from_numpy(
+        pos,
+        facts.frame_dt,
+        kinds,
+        parameters,
+        vel=None if nodes.vel is None else nodes.vel[:, moving],
+        mass=nodes.mass if np.ndim(nodes.mass) == 0 else np.asarray(nodes.mass)[moving],
+        bounds=facts.bounds,
+        periodic=facts.periodic,
+        gravity=facts.usual_gravity[: pos.shape[2]] if gravity is None and facts.usual_gravity is not None else gravity,
+        spacing=facts.spacing,
+        connectivity_radius=facts.connectivity_radius,
+        boundary=boundary,
+        cells=cells,
+        rest_pos=None if nodes.rest_pos is None or cells is None else nodes.rest_pos[moving],
+        rigid_body=None if nodes.rigid_body is None else nodes.rigid_body[moving],
+        prescribed=None if nodes.prescribed is None else nodes.prescribed[moving],
+        force=None if nodes.force is None else nodes.force[:, moving],
+        stress=None if nodes.stress is None else nodes.stress[:, moving],
+    )
+    if facts.bounds is None and nodes.ground is not None:
+        low, high = trajectory.metadata.bounds[1]
+        bounds = (trajectory.metadata.bounds[0], (min(low, nodes.ground), high), *trajectory.metadata.bounds[2:])
+        trajectory = replace(trajectory, metadata=replace(trajectory.metadata, bounds=bounds))
     return Loaded(
-        Trajectory.from_numpy(
-            pos,
-            facts.frame_dt,
-            kinds,
-            parameters,
-            vel=None if nodes.vel is None else nodes.vel[:, moving],
-            mass=nodes.mass if np.ndim(nodes.mass) == 0 else np.asarray(nodes.mass)[moving],
-            bounds=facts.bounds,
-            periodic=facts.periodic,
-            gravity=facts.usual_gravity[: pos.shape[2]] if gravity is None and facts.usual_gravity is not None else gravity,
-            spacing=facts.spacing,
-            connectivity_radius=facts.connectivity_radius,
-            boundary=boundary,
-            cells=cells,
-            rest_pos=None if nodes.rest_pos is None or cells is None else nodes.rest_pos[moving],
-            rigid_body=None if nodes.rigid_body is None else nodes.rigid_body[moving],
-            prescribed=None if nodes.prescribed is None else nodes.prescribed[moving],
-            force=None if nodes.force is None else nodes.force[:, moving],
-            stress=None if nodes.stress is None else nodes.stress[:, moving],
-        ),
+        trajectory,
         (*repairs, *wall_repairs),
         (*notes, *wall_notes),
         tuple(warnings),

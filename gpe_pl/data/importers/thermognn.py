@@ -67,7 +67,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     """Return the data set at ``path`` in the format of this module.
 
     Raises:
-        ImportFailure: there are no files ``beam_1.pt``, ``beam_2.pt``, ….
+        ImportFailure: there are no files ``beam_1.pt``, ``beam_2.pt``, …, or some are missing between them, so that the published split is unknown.
     """
     found = (
         {int(file.stem[5:]): file for file in path.iterdir() if re.fullmatch(r"beam_[0-9]{1,6}\.pt", file.name)} if path.is_dir() else {}
@@ -75,6 +75,9 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     files = [found[number] for number in sorted(found)]
     if not files:
         raise ImportFailure(f"{path}: {'holds no beam_1.pt, beam_2.pt, …' if path.is_dir() else 'no such folder'}")
+    if gaps := sorted({*range(1, max(found) + 1)} - {*found}):
+        missing = ", ".join(f"beam_{number}.pt" for number in gaps[:5]) + ", …" * (len(gaps) > 5)
+        raise ImportFailure(f"{path}: lacks {missing}; the published split needs all files up to beam_{max(found)}.pt")
     notes = (
         "frame_dt = 1/20 s is the format's, not in the files",
         f"splits are those of the source, with its seed {SPLIT_SEED}",

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import subprocess
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from shutil import rmtree
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +15,7 @@ import pytest
 
 from gpe_pl.benchmarks.learning_sets import measures, suite
 from gpe_pl.benchmarks.learning_sets.sets import FULL, ONE_STEP, POSITION, RIGIDITY, SETS, SPACING, STRESS, VELOCITY, SetName
+from gpe_pl.data.importers.source import ImportFailure
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -87,9 +91,10 @@ def test_one_seed_and_trajectory_have_no_interval() -> None:
 
 
 @pytest.fixture
-def falls(tmp_path: Path) -> Path:
-    """A folder with rollouts in the layout of FluidFall."""
-    for k in range(4):
+def falls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with rollouts in the layout of FluidFall, shorter than the published ones."""
+    monkeypatch.setitem(SETS, "fluidfall", replace(SETS["fluidfall"], num_frames=14))
+    for k in range(5):
         pos = sources.motion(14, dim=3, seed=k)
         sources.dpinet(tmp_path / "files" / "data_FluidFall" / "valid" / str(k), pos, np.gradient(pos, 1 / 60, axis=0))
     return tmp_path / "files"
@@ -128,6 +133,57 @@ def test_a_training_that_fails_names_its_command(tmp_path: Path, falls: Path, mo
         suite.LearningSetError, match=r"name=fluidfall_without_0_seed_0 seed=0 reuse=fluidfall_without_0 training.budget_minutes=10: failed"
     ):
         suite.run(suite.Settings(str(falls), only=["fluidfall"], num_splits=1), tmp_path / "runs")
+
+
+def damage(folder: Path) -> None:
+    (folder / "0" / "5.h5").write_bytes(b"cut off")
+
+
+def shorten(folder: Path) -> None:
+    (folder / "2" / "13.h5").unlink()
+
+
+def lose(folder: Path) -> None:
+    rmtree(folder / "4")
+
+
+def exchange(folder: Path) -> None:
+    rmtree(folder)
+    for k in range(5):
+        pos = sources.rigid(sources.motion(14, num_nodes=80, dim=3, seed=k), slice(0, 64))
+        sources.dpinet(folder / str(k), pos, np.gradient(pos, 1 / 60, axis=0), clusters=np.zeros((1, 64), int))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (damage, r"valid/0, frame 5: 5.h5: not a readable HDF5 file"),
+        (shorten, r"has 13, 14 frames, the data set has 14"),
+        (lose, r"has 4 trajectories, the data set has 5"),
+        (exchange, r"has fluid, solid as materials, the data set has fluid"),
+    ],
+)
+def test_files_that_are_not_the_published_ones_are_refused(
+    tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[Path], None], says: str
+) -> None:
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("nothing should be trained"))
+    change(falls / "data_FluidFall" / "valid")
+    with pytest.raises((suite.LearningSetError, ImportFailure), match=says):
+        suite.run(suite.Settings(str(falls), only=["fluidfall"], num_splits=1), tmp_path / "runs")
+    assert not (tmp_path / "runs" / "data" / "fluidfall_without_0" / "imported").exists()
+
+
+def test_files_that_changed_after_the_import_are_refused(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
+    settings = suite.Settings(str(falls), only=["fluidfall"], num_splits=1)
+    for _ in range(2):  # the second time, the imported data are used again
+        with pytest.raises(suite.LearningSetError, match="failed"):
+            suite.run(settings, tmp_path / "runs")
+    exchange(falls / "data_FluidFall" / "valid")
+    with pytest.raises(
+        suite.LearningSetError, match=r"data_FluidFall: holds other files than those that .*fluidfall_without_0 was made of"
+    ):
+        suite.run(settings, tmp_path / "runs")
 
 
 def moving(num_frames: int = 4, **arrays: Any) -> Trajectory:

@@ -36,8 +36,27 @@ def test_fronts_are_read_by_series_and_in_order(tmp_path: Path) -> None:
     path.write_text("series,T,Z\na,2,3\nb,0,1\na,1,2\n")
     a, b = measured_fronts(path)
     assert (a.series, a.x.tolist(), a.y.tolist(), b.series) == ("a", [1.0, 2.0], [2.0, 3.0], "b")
-    path.write_text("time,front\n1,2\n")
-    with pytest.raises(OutsideError, match="expected the columns series, T and Z"):
+    path.write_bytes(b"\xef\xbb\xbfseries,T,Z\r\na,0,1\r\n")  # as spreadsheets write it
+    assert measured_fronts(path)[0].y.tolist() == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"time,front\n1,2\n", "has no column T; expected the columns series, T and Z"),
+        (b"series;T;Z\na;0;1\n", "has no column T"),
+        (b"", "has no column T"),
+        (b"series,T,Z\n", "has no rows"),
+        (b"series,T,Z\na,0,1\na,nan,2\n", "line 3: T and Z are nan and 2.0, must be finite numbers"),
+        (b"series,T,Z\na,0\n", "line 2: T and Z must be numbers"),
+        (b"series,T,Z\na,0,x\n", "line 2: T and Z must be numbers .could not convert string to float: 'x'"),
+        (b"series,T,Z\n\xe9,0,1\n", "is not UTF-8"),
+    ],
+)
+def test_damaged_files_of_fronts_are_refused(tmp_path: Path, content: bytes, says: str) -> None:
+    path = tmp_path / DAM_BREAK_FILE
+    path.write_bytes(content)
+    with pytest.raises(OutsideError, match=says):
         measured_fronts(path)
 
 

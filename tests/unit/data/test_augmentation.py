@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -96,11 +97,47 @@ def test_stresses_turn_with_the_planes_they_act_on() -> None:
     np.testing.assert_allclose(traction(turn.tensor(stress), turn.vector(normal)), turn.vector(traction(stress, normal)), atol=1e-12)
 
 
+def under(truth: Trajectory, **changes: Any) -> Trajectory:
+    return replace(truth, metadata=replace(truth.metadata, **changes))
+
+
+def with_walls(truth: Trajectory, *sides: str) -> Trajectory:
+    walls = dict(zip(("x_low", "x_high", "y_low", "y_high", "z_low", "z_high"), domain_walls(truth.metadata.bounds, 0.3), strict=True))
+    scene = replace(truth, boundary=Boundary.sample(tuple(walls[side] for side in sides), 0.1, 3))
+    return under(scene, gravity=(0.0, 0.0, 0.0))
+
+
+def images(scene: Trajectory) -> np.ndarray:
+    """Return for many samples which axes are mirrored [sample, axis]."""
+    return np.array([[plane is not None for plane in Augmentation(mirror=True).reflection(scene, 0, k).planes] for k in range(64)])
+
+
+def test_without_gravity_a_floor_without_a_ceiling_is_below(truth: Trajectory) -> None:
+    fluid_fall = with_walls(truth, "y_low")
+    assert images(fluid_fall).any(axis=0).tolist() == [True, False, True]
+    turned = Augmentation(rotate=True, boost_speed=1.0).moved(fluid_fall, 0, 0, 1)
+    np.testing.assert_allclose(turned.pos[..., 1], truth.pos[..., 1], atol=1e-6)
+    assert np.abs(turned.pos[0] - truth.pos[0]).max() > 0.01
+    np.testing.assert_allclose(turned.boundary.normal, np.broadcast_to([0, 1, 0], turned.boundary.normal.shape), atol=1e-6)
+    Augmentation(rotate=True).check(fluid_fall)
+    corner = with_walls(truth, "x_low", "z_low")
+    assert images(corner).any(axis=0).tolist() == [False, True, False]
+    with pytest.raises(AugmentationError, match=r"training.rotate=true: needs scenes in 3D"):
+        windows(corner, Augmentation(rotate=True))
+
+
+def test_without_gravity_and_with_walls_on_both_sides_or_none_all_axes_are_level(truth: Trajectory) -> None:
+    for sides in ((), ("x_low", "x_high"), ("x_low", "x_high", "y_low", "y_high", "z_low", "z_high")):
+        assert images(with_walls(truth, *sides)).any(axis=0).tolist() == [True, True, True]
+    beside_a_wall = under(with_walls(truth, "x_low"), gravity=(0.0, 0.0, -9.81))  # gravity tells the vertical, whatever the walls
+    assert images(beside_a_wall).any(axis=0).tolist() == [True, True, False]
+
+
 def test_scenes_without_the_symmetry_are_refused(truth: Trajectory) -> None:
     with pytest.raises(AugmentationError, match=r"training.rotate=true: needs scenes in 3D"):
-        Augmentation(rotate=True).check(replace(truth.metadata, gravity=(1.0, 0.0, -9.0)))
+        Augmentation(rotate=True).check(under(truth, gravity=(1.0, 0.0, -9.0)))
     with pytest.raises(AugmentationError, match=r"not in periodic domains"):
-        Augmentation(boost_speed=1.0).check(replace(truth.metadata, periodic=(True, False, False)))
-    Augmentation(mirror=True).check(replace(truth.metadata, periodic=(True, False, False)))
+        Augmentation(boost_speed=1.0).check(under(truth, periodic=(True, False, False)))
+    Augmentation(mirror=True).check(under(truth, periodic=(True, False, False)))
     with pytest.raises(ValueError, match=r"not together with targets=solver"):
         TrainingSettings(num_steps=10, val_interval=10, rotate=True, targets="solver")

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from gpe_pl.trajectory.boundary import BoundaryMotion
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests import sources
-from tests.sources import motion
+from tests.sources import motion, rigid
 from tests.unit.data.importers.test_formats import imported
 
 FRAME_DT = 1 / 60
@@ -23,6 +24,7 @@ def motion_of(trajectory: Trajectory) -> BoundaryMotion:
 def test_rigid_cubes(tmp_path: Path) -> None:
     for k in range(3):
         pos = motion(num_nodes=128, dim=3, seed=k)
+        pos = rigid(pos, slice(0, 64), slice(64, 128))
         with_ground = np.concatenate([pos, np.zeros((len(pos), 1, 3), np.float32)], axis=1)
         scene = np.array([2.0, -7.5 - k, *np.zeros(6), 1.0])
         quats = np.zeros((1, 4), np.float32)
@@ -90,3 +92,38 @@ def test_a_shaken_box_moves(tmp_path: Path) -> None:
     np.testing.assert_allclose(walls.pos[0].max(axis=0), [width / 2 + 0.025, 1.025, 0.125], atol=1e-6)
     way = np.tile([0.2 * np.sin(5 / 3), 0, 0], (walls.pos.shape[1], 1))
     np.testing.assert_allclose(walls.pos[5] - walls.pos[0], way, atol=1e-6)
+
+
+def test_the_ground_is_at_zero_unless_a_node_is_below(tmp_path: Path) -> None:
+    for name, lift in (("above", 0.0), ("below", 0.35)):
+        for k in range(3):
+            pos = motion(dim=3, seed=k) - np.array([0.0, lift, 0.0], np.float32)
+            sources.dpinet(tmp_path / name / "train" / str(k), pos, np.gradient(pos, FRAME_DT, axis=0))
+        lowest = min((motion(dim=3, seed=k)[..., 1] - lift).min() for k in range(3))
+        _, stored = imported(tmp_path / name / "sets", tmp_path / name, "dpinet")
+        for trajectory in (stored["train"][0], stored["test"][0]):
+            assert trajectory.metadata.bounds[1][0] == pytest.approx(min(0.0, lowest), abs=1e-6)
+            np.testing.assert_allclose(trajectory.boundary.pos[:, 1], min(0.0, lowest), atol=1e-6)
+
+
+def test_a_damaged_first_file_does_not_hide_the_walls_of_a_bath(tmp_path: Path) -> None:
+    for k in range(4):
+        pos = rigid(motion(num_nodes=80, dim=3, seed=k), slice(0, 64))
+        sources.dpinet(tmp_path / "bath" / "train" / str(k), pos, np.gradient(pos, FRAME_DT, axis=0), clusters=np.zeros((1, 64), int))
+    (tmp_path / "bath" / "train" / "0" / "0.h5").write_bytes(b"cut off")
+    report, stored = imported(tmp_path, tmp_path / "bath", "dpinet")
+    assert len(stored["train"][0].boundary.shapes) == 5
+    assert [event.trajectory for event in report.refusals] == ["train/0"]
+
+
+def test_a_rollout_of_another_environment_is_refused(tmp_path: Path) -> None:
+    for k in range(5):
+        pos, extra = motion(num_nodes=80, dim=3, seed=k), {}
+        if k == 1:
+            pos, extra = rigid(pos, slice(0, 64)), {"clusters": np.zeros((1, 64), int)}
+        sources.dpinet(tmp_path / "fall" / "train" / str(k), pos, np.gradient(pos, FRAME_DT, axis=0), **extra)
+    report, stored = imported(tmp_path, tmp_path / "fall", "dpinet")
+    assert [str(event) for event in report.refusals] == [
+        "train, train/1: is of BoxBath, most rollouts are of FluidFall; put it into a folder of its own"
+    ]
+    assert stored["train"][0].metadata.materials == ("fluid",)

@@ -358,7 +358,7 @@ def test_a_plate_that_an_actuator_deforms(tmp_path: Path) -> None:
 
 
 def test_dpinet(tmp_path: Path) -> None:
-    rollouts = [motion(num_nodes=80, dim=3, seed=k) for k in range(4)]
+    rollouts = [sources.rigid(motion(num_nodes=80, dim=3, seed=k), slice(0, 64)) for k in range(4)]
     for k, pos in enumerate(rollouts):
         vel = np.gradient(pos, 1 / 60, axis=0)
         folder = tmp_path / "data_BoxBath" / ("valid" if k == 3 else "train") / str(k % 3)
@@ -373,7 +373,7 @@ def test_dpinet(tmp_path: Path) -> None:
         np.testing.assert_array_equal(trajectory.rigid_body, [0] * 64 + [-1] * 16)
         assert trajectory.metadata.gravity == pytest.approx((0.0, -9.8, 0.0))
         assert {s.normal for s in trajectory.boundary.shapes} >= {(0.0, 1.0, 0.0), (1.0, 0.0, 0.0)}  # type: ignore[attr-defined]
-    assert any("no usable test: the last 1 training trajectories" in note for note in report.notes)
+    assert any("the source has no test: the last 1 training trajectories" in note for note in report.notes)
 
 
 def test_dpinet_without_a_bath(tmp_path: Path) -> None:

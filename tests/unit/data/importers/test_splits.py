@@ -64,3 +64,20 @@ def test_splits_by_number(tmp_path: Path, settings: dict[str, Any], expected: di
 def test_numbers_that_do_not_fit_are_named(tmp_path: Path, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ImportFailure, match=message):
         seeds(tmp_path, raw(tmp_path, train=3), **settings)
+
+
+@pytest.mark.parametrize("settings", [{"leave_out": 3}, {"splits": {"val": [0], "test": [3]}}])
+def test_no_other_trajectory_stands_in_for_a_damaged_one(tmp_path: Path, settings: dict[str, Any]) -> None:
+    source = raw(tmp_path, train=5)
+    (source / "train" / "3" / "2.h5").write_bytes(b"cut off")
+    with pytest.raises(
+        ImportFailure, match=r"no trajectory of test can be used: test, train/3, frame 2: .*; repair or remove it, or choose"
+    ):
+        seeds(tmp_path, source, **settings)
+
+
+def test_nor_for_a_damaged_split_of_the_source(tmp_path: Path) -> None:
+    source = raw(tmp_path, train=4, valid=1)
+    (source / "valid" / "0" / "0.h5").write_bytes(b"")
+    with pytest.raises(ImportFailure, match="no trajectory of val can be used"):
+        seeds(tmp_path, source)

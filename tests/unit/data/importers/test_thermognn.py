@@ -91,6 +91,13 @@ def test_the_split_is_the_published_one(tmp_path: Path) -> None:
     assert stored == [k for (k,) in order]
 
 
+def test_a_missing_beam_would_shift_the_published_split(tmp_path: Path) -> None:
+    for k in (1, 2, 3, 5, 8):
+        write(tmp_path / f"beam_{k}.pt", 0.1 * k)
+    with pytest.raises(ImportFailure, match=r"lacks beam_4.pt, beam_6.pt, beam_7.pt; the published split needs all files up to beam_8.pt"):
+        imported(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

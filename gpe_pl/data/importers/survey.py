@@ -1,0 +1,213 @@
+"""Facts about the trajectories of a source, collected in the first pass of an import, and trajectories that differ from the others."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gpe_pl.data.free_flight import FreeFlight, joined, vector
+from gpe_pl.data.importers.report import Event
+from gpe_pl.data.importers.sampled import free_flight_of
+from gpe_pl.data.importers.source import Facts, Item, Loaded, Refusal
+from gpe_pl.data.position_rounding import MotionSummary, motion_of
+from gpe_pl.metrics.rigid import rigid_deformation
+from gpe_pl.schema import HISTORY, NODE_TYPES
+from gpe_pl.trajectory.arrays import nearest_distances
+from gpe_pl.trajectory.store import stored_arrays
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+from gpe_pl.trajectory.values import faults, size_conflicts
+
+NUM_SAMPLED = 8
+"""Number of trajectories from which spacing, neighbours and free flight are measured. Training trajectories come first."""
+MOST_FLIGHTS = 4 * NUM_SAMPLED
+"""Free flight is measured in so many trajectories if they have different gravity."""
+ENOUGH_OF_ONE = 5
+"""Number of groups in free flight, over the examined frames of one trajectory, that can tell that its gravity is wrong."""
+LONG_ENOUGH = HISTORY + 2
+"""Number of frames that a model needs with the default history."""
+COINCIDENCE = 1e-3
+"""Nodes closer than this fraction of the median distance to the nearest node, in the first frame, count as at one place."""
+FRAMES_COMPARED = 200
+"""Number of first frames in which displacements and velocities are compared."""
+SPACING_RATIO = 3.0
+"""A warning is given if two distances that should be alike differ by more than this factor."""
+USUAL = 0.75
+"""Fraction of the trajectories that must have the same number of frames for a shorter one to be a suspect."""
+NOT_RIGID, DEFORMED = 1e-3, 0.1
+"""Changes of the distances in a rigid body, relative to its size. Above the first, a warning is given. Above the second, the trajectory is refused."""
+
+
+@dataclass
+class Survey:
+    """Facts collected in the first pass.
+
+    Attributes:
+        good: usable trajectories by split.
+        materials: materials of all trajectories.
+        columns: names of the parameters of all trajectories.
+        stressed: materials with a stress in any trajectory.
+        loads: loads that any trajectory has.
+        bounds: bounds of each trajectory, ``(low, high)`` per axis [m].
+        nearest: split, name and median distance to the nearest node [m] of each trajectory.
+        lengths: split, name and number of frames of each trajectory.
+        spacings, radii: spacing and connectivity radius of each sampled trajectory [m].
+        velocity_ratios: mean displacement over mean velocity × frame interval, of each sampled trajectory.
+        scenes: names of trajectories by the digest of their positions.
+        motions: split, name and motion of each trajectory.
+        assumes_gravity: for each trajectory, whether its gravity is only assumed to be the usual one of the format.
+        suspects: warnings about trajectories.
+        num_bytes: size of all arrays.
+        flights: groups in free flight of each sampled trajectory.
+        common: frame interval [s], dimension and periodic axes of all trajectories.
+    """
+
+    good: dict[str, list[Item]] = field(default_factory=dict)
+    materials: set[str] = field(default_factory=set)
+    columns: set[str] = field(default_factory=set)
+    stressed: set[str] = field(default_factory=set)
+    loads: set[str] = field(default_factory=set)
+    bounds: list[tuple[tuple[float, float], ...]] = field(default_factory=list)
+    nearest: list[tuple[str, str, float]] = field(default_factory=list)
+    lengths: list[tuple[str, str, int]] = field(default_factory=list)
+    spacings: list[float] = field(default_factory=list)
+    radii: list[float] = field(default_factory=list)
+    velocity_ratios: list[float] = field(default_factory=list)
+    scenes: dict[bytes, str] = field(default_factory=dict)
+    motions: list[tuple[str, str, MotionSummary]] = field(default_factory=list)
+    assumes_gravity: list[bool] = field(default_factory=list)
+    suspects: list[Event] = field(default_factory=list)
+    num_bytes: int = 0
+    flights: list[Flight] = field(default_factory=list)
+    common: tuple[float, int, tuple[bool, ...]] | None = None
+
+    def add(self, split: str, item: Item, loaded: Loaded, facts: Facts) -> None:
+        """Add a trajectory.
+
+        Raises:
+            Refusal: it is invalid, does not fit the others, or is one of them.
+        """
+        trajectory, name = loaded.trajectory, item.name
+        m, where = trajectory.metadata, f"{split}, {name}"
+        arrays = stored_arrays(trajectory)
+        for fault in _faults(m, arrays):
+            raise Refusal(fault)
+        common = (m.frame_dt, m.dim, m.periodic)
+        if self.common is None:
+            self.common = common
+        if common != self.common:
+            raise Refusal(
+                f"frame_dt, dimension and periodic axes are {common}, of the trajectories before {self.common}; a data set has the same in all of them"
+            )
+        if not np.any(trajectory.pos != trajectory.pos[:1]):
+            raise Refusal("nothing moves")
+        deformation = 0.0 if trajectory.rigid_body is None else rigid_deformation(trajectory, trajectory.num_frames - 1)
+        if deformation > DEFORMED:
+            raise Refusal(
+                f"rigid_body: distances in a body change by {deformation:.3g} of its size, so it is not rigid; leave rigid_body out"
+            )
+        digest = _digest(trajectory.pos)
+        if self.scenes.setdefault(digest, where) != where:
+            raise Refusal(f"has exactly the positions of {self.scenes[digest]}: the same scene twice")
+        if deformation > NOT_RIGID:
+            what = f"distances in a rigid body change by {deformation:.3g} of its size; models keep them"
+            self.suspects.append(Event(split, name, -1, what))
+        self.good.setdefault(split, []).append(item)
+        self.suspects += [Event(split, name, -1, warning) for warning in loaded.warnings]
+        self.motions.append((split, name, motion_of(m, trajectory.pos)))
+        self.assumes_gravity.append(loaded.assumes_gravity)
+        if trajectory.num_frames < LONG_ENOUGH:
+            what = f"has {trajectory.num_frames} frames; models leave it out unless graph.history is below the default, which needs {LONG_ENOUGH}"
+            self.suspects.append(Event(split, name, -1, what))
+        nearest = nearest_distances(trajectory.pos[0].astype(np.float64), m.periodicity)
+        at_one_place = np.flatnonzero((nearest == 0) | (nearest < COINCIDENCE * np.median(nearest)))
+        if len(at_one_place):
+            what = f"{len(at_one_place)} nodes are at the place of another node, the first is node {at_one_place[0]}: do bodies overlap?"
+            self.suspects.append(Event(split, name, 0, what))
+        self.nearest.append((split, name, float(np.median(nearest))))
+        self.lengths.append((split, name, trajectory.num_frames))
+        self.materials |= set(m.materials)
+        self.columns |= set(m.param_names)
+        self.loads |= set(m.loads or ())
+        self.stressed |= set(m.with_stress if trajectory.stress is not None else ())
+        self.num_bytes += sum(array.nbytes for array in arrays.values())
+        self.bounds.append(m.bounds)
+        has_other_gravity = all(flight.gravity != m.gravity for flight in self.flights)
+        if len(self.flights) < NUM_SAMPLED or (has_other_gravity and len(self.flights) < MOST_FLIGHTS):
+            self.flights.append(Flight(split, name, m.gravity, loaded.assumes_gravity, free_flight_of(trajectory, facts)))
+        if len(self.spacings) < NUM_SAMPLED:
+            self.spacings.append(m.spacing)
+            self.radii.append(m.connectivity_radius)
+            if (ratio := _velocity_ratio(trajectory)) is not None:
+                self.velocity_ratios.append(ratio)
+
+    def look_for_outliers(self) -> None:
+        """Add suspects: trajectories whose distances, length or free flight differ from those of the others."""
+        usual = float(np.median([distance for _, _, distance in self.nearest]))
+        for split, name, distance in self.nearest:
+            if np.isfinite(usual) and not usual / SPACING_RATIO <= distance <= usual * SPACING_RATIO:
+                what = f"nodes are {distance:.4g} m from the nearest one, in the median of all trajectories {usual:.4g} m: is its unit of length another?"
+                self.suspects.append(Event(split, name, 0, what))
+        ((length, count),) = Counter(length for _, _, length in self.lengths).most_common(1)
+        for split, name, own in self.lengths:
+            if own < length and count >= USUAL * len(self.lengths):
+                self.suspects.append(Event(split, name, -1, f"has {own} frames, most trajectories have {length}: was it cut off?"))
+
+    def look_for_wrong_gravity(self, assumed: tuple[float, ...] | None, dim: int) -> None:
+        """Add suspects: sampled trajectories whose groups in free flight accelerate in another way than their gravity, while those of the others agree with it.
+
+        Args:
+            assumed: gravity [dim] in m/s² of the trajectories that do not state it.
+            dim: dimension of space.
+        """
+        flights = [f.free.under(assumed) if f.assumed and assumed is not None else f.free for f in self.flights]
+        for k, (f, free) in enumerate(zip(self.flights, flights, strict=True)):
+            others = joined(flights[:k] + flights[k + 1 :], dim)
+            confirmed = 2 * others.num_disturbed < others.num_free
+            if confirmed and free.num_free >= ENOUGH_OF_ONE and free.agrees_on_another:
+                stored = vector(np.median(free.gravity, axis=0))
+                what = f"gravity is stored as {stored}, but {free.num_free} groups in free flight agree on {vector(free.typical)}"
+                self.suspects.append(Event(f.split, f.name, -1, what))
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Groups in free flight of a trajectory.
+
+    Attributes:
+        split, name: the trajectory.
+        gravity: its gravity [dim] in m/s².
+        assumed: whether this is only assumed.
+        free: the groups.
+    """
+
+    split: str
+    name: str
+    gravity: tuple[float, ...]
+    assumed: bool
+    free: FreeFlight
+
+
+def _digest(pos: np.ndarray) -> bytes:
+    """Return a digest of positions [frame, node, dim] that does not depend on the order of the nodes."""
+    order = np.lexsort(pos[[0, -1]].transpose(0, 2, 1).reshape(-1, pos.shape[1]))
+    return hashlib.sha256(np.ascontiguousarray(pos[:, order]).tobytes()).digest()
+
+
+def _velocity_ratio(trajectory: Trajectory) -> float | None:
+    """Return mean displacement over mean velocity × frame interval; None for nodes without velocity."""
+    m, first = trajectory.metadata, trajectory.frames(0, FRAMES_COMPARED)
+    step = np.linalg.norm(m.periodicity.shortest(np.diff(first.pos.astype(np.float64), axis=0)), axis=-1).mean()
+    speed = np.linalg.norm(first.vel.astype(np.float64), axis=-1)
+    speed = (0.5 * (speed[1:] + speed[:-1])).mean()
+    return float(step / (speed * m.frame_dt)) if speed > 0 else None
+
+
+def _faults(m: Metadata, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
+    """Yield the reasons why the store would refuse the metadata or arrays of a trajectory."""
+    yield from (f"{key} {violation}" for key, violation in m.violations())
+    yield from size_conflicts(arrays, m.dim, len(m.param_names))
+    yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))

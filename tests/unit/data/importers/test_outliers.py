@@ -1,0 +1,94 @@
+"""Trajectories that differ from the others of their source are named: unit of length, length, gravity, and bodies that are not rigid."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpe_pl.data.importers import ImportFailure
+from gpe_pl.data.importers.report import Report
+from gpe_pl.trajectory.arrays import ArrayError, checked_bodies
+from tests.unit.data.importers.test_formats import imported
+
+DT, GRAVITY, NUM_FRAMES, LANDS = 0.01, -9.81, 30, 24
+BLOCK = 0.05 * np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
+
+
+def flying(seed: int, **changes: Any) -> dict[str, Any]:
+    """Return the arrays of a block that flies and stops in one frame, as an obstacle would stop it."""
+    rng = np.random.default_rng(seed)
+    time = DT * np.arange(NUM_FRAMES)[:, None, None]
+    pos = BLOCK + np.array([0.0, 3.0]) + rng.uniform(-1, 1, 2) * time + np.array([0.0, GRAVITY / 2]) * time**2
+    pos[LANDS:] = pos[LANDS - 1]
+    return {"pos": pos, "frame_dt": DT, "materials": "solid", "params_solid": 1e6, "gravity": [0.0, GRAVITY], **changes}
+
+
+def warnings(folder: Path, trajectories: list[dict[str, Any]]) -> list[str]:
+    return report(folder, trajectories).warnings
+
+
+def report(folder: Path, trajectories: list[dict[str, Any]]) -> Report:
+    (folder / "raw" / "train").mkdir(parents=True)
+    for k, arrays in enumerate(trajectories):
+        np.savez(folder / "raw" / "train" / f"{k}.npz", **arrays)
+    return imported(folder / "sets", folder / "raw", "arrays")[0]
+
+
+def test_alike_trajectories_are_not_suspects(tmp_path: Path) -> None:
+    assert not warnings(tmp_path, [flying(k) for k in range(6)])
+
+
+def test_another_unit_of_length(tmp_path: Path) -> None:
+    said = warnings(tmp_path, [flying(k, **({"pos": 1000 * flying(k)["pos"]} if k == 2 else {})) for k in range(6)])
+    assert any(
+        w.startswith("train, 2.npz, frame 0: nodes are 50 m from the nearest one, in the median of all trajectories 0.05 m") for w in said
+    )
+
+
+def test_a_trajectory_that_was_cut_off(tmp_path: Path) -> None:
+    said = warnings(tmp_path, [flying(k, **({"pos": flying(k)["pos"][:26]} if k == 1 else {})) for k in range(6)])
+    assert said == ["train, 1.npz: has 26 frames, most trajectories have 30: was it cut off?"]
+
+
+def test_lengths_that_all_differ_are_no_fault(tmp_path: Path) -> None:
+    assert not warnings(tmp_path, [flying(k, pos=flying(k)["pos"][: 30 - k]) for k in range(5)])
+
+
+def test_gravity_with_the_wrong_sign_in_one_trajectory(tmp_path: Path) -> None:
+    said = warnings(tmp_path, [flying(k, **({"gravity": [0.0, -GRAVITY]} if k == 1 else {})) for k in range(6)])
+    (what,) = said
+    assert what.startswith("train, 1.npz: gravity is stored as (0, 9.81) m/s², but 2")
+    assert "groups in free flight agree on (0, -9.8" in what
+
+
+def test_a_body_that_pulsates_is_not_rigid(tmp_path: Path) -> None:
+    body = np.zeros(36, int)
+    sound = [flying(k, rigid_body=body) for k in range(4)]
+    swings = 1 + 0.3 * np.sin(np.arange(NUM_FRAMES))[:, None, None]
+    pulsating = flying(4, rigid_body=body, pos=flying(4)["pos"] + (swings - 1) * BLOCK)
+    found = report(tmp_path / "some", [*sound, pulsating])
+    (refusal,) = found.refusals
+    assert str(refusal).startswith("train, 4.npz: rigid_body: distances in a body change by 0.")
+    with pytest.raises(ImportFailure, match="so it is not rigid; leave rigid_body out"):
+        report(tmp_path / "all", [pulsating])
+    nearly = flying(4, rigid_body=body, pos=flying(4)["pos"] + 0.02 * (swings - 1) * BLOCK)
+    (what,) = warnings(tmp_path / "nearly", [*sound, nearly])
+    assert what.startswith("val, 4.npz: distances in a rigid body change by 0.00")
+
+
+def test_the_same_scene_with_its_nodes_in_another_order_is_there_twice(tmp_path: Path) -> None:
+    again = flying(0)
+    order = np.random.default_rng(0).permutation(36)
+    found = report(tmp_path, [flying(0), flying(1), flying(2), {**again, "pos": again["pos"][:, order]}])
+    assert [str(event) for event in found.refusals] == ["train, 3.npz: has exactly the positions of train, 0.npz: the same scene twice"]
+
+
+@pytest.mark.parametrize("number", [2**31, 2**32, -(2**33)])
+def test_numbers_of_bodies_that_do_not_fit_are_refused(number: int) -> None:
+    with pytest.raises(ArrayError, match=rf"rigid_body: node 2 is {number}, must be -1 or the number of a body, up to 2147483647"):
+        checked_bodies(np.array([0, 0, number]), 3)
+    np.testing.assert_array_equal(checked_bodies(np.array([2**31 - 1, -1]), 2), [2**31 - 1, -1])
+    np.testing.assert_array_equal(checked_bodies(np.array([3], np.uint8), 1), [3])
