@@ -23,13 +23,13 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics import Metric
 
-from gpe_pl.metrics import bodies, liquids, open_scenes, rigid
+from gpe_pl.metrics import bodies, liquids, open_scenes
 from gpe_pl.metrics.bodies import Bodies, body_metrics
 from gpe_pl.metrics.liquids import liquid_metrics, liquid_nodes
 from gpe_pl.metrics.mirror import mirror_error, mirrors
-from gpe_pl.metrics.rigid import rigid_deformation
 from gpe_pl.rollout.loop import fraction_outside
 from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.rigid_deformation import rigid_deformation
 from gpe_pl.trajectory.state import von_mises
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
@@ -52,7 +52,7 @@ UNITS: dict[str, str] = {
     "fraction_outside": "1",
     "mirror_error": "1",
     **bodies.UNITS,
-    **rigid.UNITS,
+    "rigid_deformation": "1",
     **liquids.UNITS,
     **open_scenes.UNITS,
 }

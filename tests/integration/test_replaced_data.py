@@ -31,7 +31,7 @@ def falling(gravity: float, seed: int = 0) -> list[Trajectory]:
     """Return falling blocks of sand, slightly rotated."""
     rng, dt = np.random.default_rng(seed), 0.01
     made = []
-    for _ in range(3):
+    for _ in range(4):
         start = (
             np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) * 0.05
             + [0.3, 1.0]
@@ -56,7 +56,7 @@ def falling(gravity: float, seed: int = 0) -> list[Trajectory]:
 def imported(folder: Path, gravity: float) -> Path:
     shutil.rmtree(folder / "mine", ignore_errors=True)
     made = falling(gravity)
-    save_dataset(folder, "mine", train=made[:2], val=made[2:], test=made[2:])
+    save_dataset(folder, "mine", train=made[:2], val=made[2:3], test=made[3:])
     return folder
 
 

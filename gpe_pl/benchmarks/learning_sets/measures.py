@@ -13,11 +13,11 @@ from gpe_pl.evaluation.predictions import Predictor
 from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.liquids import liquid_nodes
-from gpe_pl.metrics.rigid import rigid_deformation
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import Simulator, sound, step_all
 from gpe_pl.trajectory.arrays import nearest_distances
+from gpe_pl.trajectory.rigid_deformation import rigid_deformation
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 

@@ -14,9 +14,9 @@ from gpe_pl.data.importers.report import Event
 from gpe_pl.data.importers.sampled import free_flight_of
 from gpe_pl.data.importers.source import Facts, Item, Loaded, Refusal
 from gpe_pl.data.position_rounding import MotionSummary, motion_of
-from gpe_pl.metrics.rigid import rigid_deformation
 from gpe_pl.schema import HISTORY, NODE_TYPES
 from gpe_pl.trajectory.arrays import nearest_distances
+from gpe_pl.trajectory.rigid_deformation import rigid_deformation
 from gpe_pl.trajectory.store import stored_arrays
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from gpe_pl.trajectory.values import faults, size_conflicts

@@ -27,7 +27,7 @@ from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.geometry.shapes import Box, Shape, Sphere, domain_walls
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.metrics import UNITS, bodies, open_scenes, rigid
+from gpe_pl.metrics import UNITS, bodies, open_scenes
 from gpe_pl.models.base import Model
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
@@ -165,7 +165,7 @@ def test_powers_of_two_change_nothing_but_the_units(length: int, time: int, tmp_
     assert own_losses == losses
     assert own_step == step > INTERVAL
     assert {r.metric for r in rows} >= {"fraction_corrected", "fraction_outside_uncontained", "fraction_outside_at_end", *UNIT_OF} - {
-        "skipping_mse", "von_mises_error", "stress_error", "mirror_error", *bodies.UNITS, *rigid.UNITS, *open_scenes.UNITS,
+        "skipping_mse", "von_mises_error", "stress_error", "mirror_error", *bodies.UNITS, "rigid_deformation", *open_scenes.UNITS,
     }  # fmt: skip
     assert max(r.value for r in rows if r.metric == "fraction_corrected") > 0
     horizons, own_horizons = ([*dict.fromkeys(r.horizon for r in found)] for found in (rows, own_rows))  # in seconds

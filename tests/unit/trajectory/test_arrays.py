@@ -333,7 +333,7 @@ def test_what_is_missing_is_taken_from_the_end_of_train(tmp_path: Path) -> None:
     assert {split: c.trajectories for split, c in report.splits.items()} == {"train": 6, "val": 3, "test": 3}
     path = tmp_path / "mine" / "imported" / "val" / "shard-00000.h5"
     np.testing.assert_array_equal(read_trajectory(path, "00000").pos, motion(seed=9))
-    assert sum("has no usable" in note for note in report.notes) == 2
+    assert sum("the source has no" in note for note in report.notes) == 2
 
 
 def test_imported_data_are_never_overwritten(tmp_path: Path) -> None:

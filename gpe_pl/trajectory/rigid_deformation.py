@@ -1,4 +1,4 @@
-"""Deformation of rigid bodies in a rollout."""
+"""Deformation of rigid bodies."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 MAX_COMPARED = 64
 """Maximum number of nodes of a body between which distances are compared; they are spread evenly over its rows."""
-
-UNITS: dict[str, str] = {"rigid_deformation": "1"}
 
 
 def rigid_deformation(trajectory: Trajectory, num_steps: int) -> float:
