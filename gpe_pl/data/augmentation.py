@@ -1,10 +1,11 @@
-"""Augmentation of training windows by symmetries of mechanics: mirror images, rotations about gravity, and frames of reference that move.
+"""Augmentation of training windows by symmetries of mechanics: mirror images, rotations, and frames of reference that move.
 
 All of them are exact: the image of a window, with its walls, is a window that the same solver could have made. Each sample draws its own image.
 
 - A mirror image maps the domain onto itself.
 - A rotation turns walls along with the scene, so the walls of its image are oblique.
 - The vertical is the axis of gravity; without gravity, the axis along which all walls face one way (``trajectory.reflection.level_axes``).
+- Quarter turns rotate gravity along with the scene. A model that never saw another direction of gravity may have learned which way is down.
 - A frame of reference that moves (Galilean shift) adds one velocity to everything. Walls that were at rest then move, because friction and contact depend on
   velocities relative to walls. Without moving walls the image would be wrong wherever a wall is near.
 """
@@ -20,8 +21,11 @@ from gpe_pl.trajectory.boundary import BoundaryMotion
 from gpe_pl.trajectory.reflection import Reflection, Rotation, level_axes
 from gpe_pl.trajectory.trajectory import Trajectory
 
-MIRROR_STREAM, TURN_STREAM, BOOST_STREAM = 1, 2, 3
+MIRROR_STREAM, TURN_STREAM, BOOST_STREAM, QUARTER_STREAM = 1, 2, 3, 4
 """Further components of the seed, which make the draws independent of the noise and of each other."""
+
+NUM_TURNS = {2: 4, 3: 24}
+"""Number of rotations that map axes onto axes, by dimension."""
 
 
 class AugmentationError(GpeError, ValueError):
@@ -35,17 +39,19 @@ class Augmentation:
     Attributes:
         mirror: mirror each window at random. Every level axis is mirrored with probability 1/2, independently of the others.
         rotate: turn each window about the vertical by a random angle; in 3D.
+        quarter_turns: turn each window, with its gravity, by one of the rotations that map axes onto axes, drawn uniformly.
         boost_speed: speed [m/s] up to which a random velocity, along each level axis, is added to the scene and its walls.
     """
 
     mirror: bool = False
     rotate: bool = False
+    quarter_turns: bool = False
     boost_speed: float = 0.0
 
     @property
     def is_beyond_mirror(self) -> bool:
         """Whether images differ by more than a reflection."""
-        return self.rotate or self.boost_speed > 0
+        return self.rotate or self.quarter_turns or self.boost_speed > 0
 
     def check(self, trajectory: Trajectory) -> None:
         """Check that a scene has the symmetries.
@@ -66,7 +72,7 @@ class Augmentation:
             )
         if self.is_beyond_mirror and any(metadata.periodic):
             raise AugmentationError(
-                "training.rotate and training.boost_speed: not in periodic domains, which stay as they are; leave them off"
+                "training.rotate, quarter_turns and boost_speed: not in periodic domains, which stay as they are; leave them off"
             )
 
     def reflection(self, trajectory: Trajectory, seed: int, sample: int) -> Reflection:
@@ -88,7 +94,28 @@ class Augmentation:
             velocity = np.random.default_rng((seed, sample, BOOST_STREAM)).uniform(-self.boost_speed, self.boost_speed, metadata.dim)
             velocity[[axis for axis in range(metadata.dim) if axis not in level]] = 0.0
             trajectory = boosted(trajectory, velocity, frame)
+        if self.quarter_turns:
+            number = np.random.default_rng((seed, sample, QUARTER_STREAM)).integers(NUM_TURNS[metadata.dim])
+            trajectory = turned_with_gravity(trajectory, int(number))
         return trajectory
+
+
+def turned_with_gravity(trajectory: Trajectory, number: int) -> Trajectory:
+    """Return a trajectory turned about the middle of its domain, with its gravity and bounds; see ``Rotation.between_axes``."""
+    metadata, bounds = trajectory.metadata, np.array(trajectory.metadata.bounds)
+    turn = Rotation.between_axes(number, bounds.mean(axis=1).tolist())
+    corners = turn.point(bounds.T)
+    image = turn.trajectory(trajectory)
+    source = np.abs(turn.matrix).argmax(axis=1)  # the axis that each axis of the image was
+    return replace(
+        image,
+        metadata=replace(
+            metadata,
+            bounds=tuple(zip(corners.min(axis=0).tolist(), corners.max(axis=0).tolist(), strict=True)),
+            gravity=tuple(turn.vector(np.array(metadata.gravity)).tolist()),
+        ),
+        prescribed=None if trajectory.prescribed is None else np.ascontiguousarray(trajectory.prescribed[:, source]),
+    )
 
 
 def _level(trajectory: Trajectory) -> list[int]:

@@ -25,7 +25,7 @@ def check_settings(unroll_steps: int, has_solver_targets: bool, has_augmentation
     if has_solver_targets:
         raise OpenScenesError(f"training.targets=solver: {where}; set targets=trajectory")
     if has_augmentation:
-        raise OpenScenesError(f"training.mirror, rotate and boost_speed: {where}, which are not moved along; leave them off")
+        raise OpenScenesError(f"training.mirror, rotate, quarter_turns and boost_speed: {where}, which are not moved along; leave them off")
 
 
 def continued(window: Trajectory) -> Float64[np.ndarray, "frame node dim"]:

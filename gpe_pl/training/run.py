@@ -60,7 +60,7 @@ class TrainingSettings:
         push_fraction: fraction of the steps, at the end of training, that use push-forward.
         push_steps: maximum number of steps of an unroll.
         push_correction: fraction of the velocity's deviation after an unroll that the target removes within one step, with ``targets=trajectory``.
-        mirror, rotate, boost_speed: images of training windows, see ``data.augmentation``.
+        mirror, rotate, quarter_turns, boost_speed: images of training windows, see ``data.augmentation``.
         targets: targets of noisy and unrolled states, see ``Targets`` and ``data.solver_targets``.
         early_layers: train only the weights that ``start_from`` did not give, the embeddings of materials, the encoders, and this number of the first
             message-passing steps; None trains all weights.
@@ -84,6 +84,7 @@ class TrainingSettings:
     targets: Targets = "trajectory"
     mirror: bool = False
     rotate: bool = False
+    quarter_turns: bool = False
     boost_speed: Annotated[float, Field(ge=0, le=100)] = 0.0
     sampling: Sampling = "uniform"
     push_fraction: Annotated[float, Field(ge=0, le=1)] = 0.0
@@ -108,7 +109,9 @@ class TrainingSettings:
                 f"val_interval={self.val_interval} must divide num_steps={self.num_steps}: the last steps would be neither validated nor saved"
             )
         if self.augmentation.is_beyond_mirror and self.targets != "trajectory":
-            raise ValueError(f"rotate and boost_speed: not together with targets={self.targets}, whose walls stay; set targets=trajectory")
+            raise ValueError(
+                f"rotate, quarter_turns and boost_speed: not together with targets={self.targets}, whose walls stay; set targets=trajectory"
+            )
         if (self.unroll_steps or 1) > 1:
             if self.push_fraction:
                 raise ValueError(
@@ -120,7 +123,7 @@ class TrainingSettings:
     @property
     def augmentation(self) -> Augmentation:
         """Images of training windows."""
-        return Augmentation(self.mirror, self.rotate, self.boost_speed)
+        return Augmentation(self.mirror, self.rotate, self.quarter_turns, self.boost_speed)
 
     @property
     def noise(self) -> Noise:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations, product
 from typing import Any, Protocol
 
 import numpy as np
@@ -138,11 +139,11 @@ class Reflection(Isometry):
 
 @dataclass(frozen=True)
 class Rotation(Isometry):
-    """Rotation of scenes in 3D, with NumPy arrays.
+    """Rotation of scenes, with NumPy arrays.
 
     Attributes:
-        matrix: rotation of vectors [3, 3].
-        centre: point that stays [3] in m.
+        matrix: rotation of vectors [dim, dim].
+        centre: point that stays [dim] in m.
     """
 
     matrix: np.ndarray
@@ -156,19 +157,30 @@ class Rotation(Isometry):
         matrix[[first, first, second, second], [first, second, first, second]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
         return cls(matrix, np.asarray(centre, float))
 
+    @classmethod
+    def between_axes(cls, number: int, centre: Sequence[float]) -> Rotation:
+        """Return one of the rotations about a point [dim] in m that map axes onto axes: 4 in 2D, 24 in 3D, numbered from 0, the identity."""
+        dim = len(centre)
+        signed = (
+            np.eye(dim)[list(order)] * np.array(signs) for order in permutations(range(dim)) for signs in product((1.0, -1.0), repeat=dim)
+        )
+        return cls([matrix for matrix in signed if np.linalg.det(matrix) > 0][number], np.asarray(centre, float))
+
     def vector(self, x: Array) -> Array:
-        """Return the images of vectors [..., 3]."""
+        """Return the images of vectors [..., dim]."""
         return (x @ self.matrix.T).astype(x.dtype)
 
     def point(self, x: Array) -> Array:
-        """Return the images of positions [..., 3] in m."""
+        """Return the images of positions [..., dim] in m."""
         return ((x - self.centre) @ self.matrix.T + self.centre).astype(x.dtype)
 
     def tensor(self, x: Array) -> Array:
-        """Return the images of stresses [..., 6], in the order of ``schema.STRESS_COMPONENTS``."""
-        full = x[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*x.shape[:-1], 3, 3)
-        turned = self.matrix @ full @ self.matrix.T
-        return turned.reshape(*x.shape[:-1], 9)[..., [0, 1, 2, 4, 5, 8]].astype(x.dtype)
+        """Return the images of stresses [..., component], in the order of ``schema.STRESS_COMPONENTS``."""
+        dim = len(self.centre)
+        places, rows = ([0, 1, 1, 2], [0, 1, 3]) if dim == 2 else ([0, 1, 2, 1, 3, 4, 2, 4, 5], [0, 1, 2, 4, 5, 8])
+        turned = self.matrix @ x[..., places].reshape(*x.shape[:-1], dim, dim) @ self.matrix.T
+        in_plane = turned.reshape(*x.shape[:-1], dim**2)[..., rows]
+        return np.concatenate([in_plane, x[..., len(rows) :]], axis=-1).astype(x.dtype)
 
 
 def _row(values: list[float], like: Any) -> Array:

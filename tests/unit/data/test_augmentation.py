@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl.data.augmentation import Augmentation, AugmentationError, boosted
+from gpe_pl.data.augmentation import Augmentation, AugmentationError, boosted, turned_with_gravity
 from gpe_pl.data.dataset import StartKey, StoredTrajectory, WindowDataset
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
@@ -84,6 +84,53 @@ def test_a_wall_that_moves_already_gets_the_velocity_in_addition(truth: Trajecto
     assert twice.boundary.motion is not None
     np.testing.assert_allclose(twice.boundary.motion.vel, np.broadcast_to([0.0, 0.5, 0.0], twice.boundary.motion.vel.shape), atol=1e-7)
     np.testing.assert_allclose(twice.boundary.motion.pos[4], truth.boundary.pos, atol=1e-6)
+
+
+@pytest.mark.parametrize("number", range(24))
+def test_a_quarter_turn_takes_gravity_walls_and_targets_along(truth: Trajectory, number: int) -> None:
+    matrix = Rotation.between_axes(number, (0.0, 0.0, 0.0)).matrix
+    image = turned_with_gravity(truth, number)
+    np.testing.assert_allclose(image.metadata.gravity, matrix @ truth.metadata.gravity)
+    np.testing.assert_allclose(np.ptp(image.metadata.bounds, axis=1), np.abs(matrix) @ [1.0, 0.8, 0.6])
+    middle = np.array([0.5, 0.4, 0.3])
+    np.testing.assert_allclose(image.pos - middle, (truth.pos - middle) @ matrix.T, atol=1e-6)
+    np.testing.assert_allclose(image.boundary.normal, truth.boundary.normal @ matrix.T, atol=1e-7)
+    low, high = np.array(image.metadata.bounds).T
+    assert (image.boundary.pos >= low - 1e-6).all() and (image.boundary.pos <= high + 1e-6).all()
+    before, after = windows(truth, Augmentation())[StartKey(2, 1, 2)], windows(image, Augmentation())[StartKey(2, 1, 2)]
+    turned = before.target(before.state, 0, DT)[0] @ torch.from_numpy(matrix).T
+    torch.testing.assert_close(after.target(after.state, 0, DT)[0], turned, rtol=0, atol=2e-2)  # stored in float32
+
+
+@pytest.mark.parametrize(("dim", "count"), [(2, 4), (3, 24)])
+def test_rotations_between_axes_are_a_group(dim: int, count: int) -> None:
+    matrices = [Rotation.between_axes(number, (0.0,) * dim).matrix for number in range(count)]
+    np.testing.assert_array_equal(matrices[0], np.eye(dim))
+    known = {(matrix + 0.0).tobytes() for matrix in matrices}  # without negative zeros
+    assert len(known) == count and all(((a @ b) + 0.0).tobytes() in known for a in matrices for b in matrices)
+    assert all(np.linalg.det(matrix) == pytest.approx(1) for matrix in matrices)
+    with pytest.raises(IndexError):
+        Rotation.between_axes(count, (0.0,) * dim)
+
+
+def test_every_direction_of_gravity_is_drawn_alike() -> None:
+    pos = np.random.default_rng(0).uniform(0.2, 0.8, (5, 6, 2))
+    held = np.zeros((6, 2), bool)
+    held[1, 0] = True
+    scene = Trajectory.from_numpy(pos, DT, "sand", {"sand": 30.0}, bounds=[[0, 2], [0, 1]], gravity=(0.0, -9.81), prescribed=held)
+    moved = [Augmentation(quarter_turns=True).moved(scene, 1, 0, sample) for sample in range(400)]
+    counts: dict[tuple[float, ...], int] = {}
+    for image in moved:
+        assert image.prescribed is not None and image.prescribed.sum() == 1
+        assert image.prescribed[1].tolist() == [image.metadata.gravity[0] == 0, image.metadata.gravity[1] == 0]  # across gravity, as before
+        counts[image.metadata.gravity] = counts.get(image.metadata.gravity, 0) + 1
+    assert len(counts) == 4 and min(counts.values()) > 70
+
+
+def test_a_stress_in_the_plane_turns_with_it() -> None:
+    turn, stress = Rotation.between_axes(1, (0.0, 0.0)), np.array([1.0, 2.0, 3.0, 4.0])
+    full = turn.matrix @ np.array([[1.0, 2.0], [2.0, 3.0]]) @ turn.matrix.T
+    np.testing.assert_allclose(turn.tensor(stress), [full[0, 0], full[0, 1], full[1, 1], 4.0])
 
 
 def test_stresses_turn_with_the_planes_they_act_on() -> None:

@@ -177,7 +177,7 @@ def test_activity_counts_nodes_while_they_are_there(tmp_path: Path, trajectory: 
         ),
         (
             {"augmentation": Augmentation(mirror=True)},
-            "training.mirror, rotate and boost_speed: the data have scenes with inlets and outlets",
+            "training.mirror, rotate, quarter_turns and boost_speed: the data have scenes with inlets and outlets",
         ),
     ],
 )
