@@ -17,10 +17,12 @@ from gpe_pl.export.program import MirrorAverageError, export_model
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.checkpoint_file import CheckpointError
+from gpe_pl.learned.mirror_average import MirrorAverage
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.loop import SimulationError, Simulator, steps
 from gpe_pl.rollout.mirrored import Mirrored
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests.runs import compose
 
@@ -92,6 +94,23 @@ def test_gravity_along_every_axis_leaves_nothing_to_average(scene: tuple[Learned
     mean.step(state)  # has images of the boundary, which the next state shares
     tilted = replace(state, gravity=torch.full_like(state.gravity, -1.0))
     assert torch.equal(mean.step(tilted).pos, learned.step(tilted).pos)
+
+
+def test_without_gravity_no_image_has_its_floor_above(scene: tuple[LearnedSimulator, Trajectory]) -> None:
+    learned, trajectory = scene
+    state = learned.initial_state(trajectory, START)
+    floor = state.boundary.take(torch.nonzero(state.boundary.normal[:, 1] > 0.9)[:, 0])
+    seen: list[State] = []
+
+    def recorded(states: list[State]) -> list[State | SimulationError]:
+        seen.extend(states)
+        return list(states)
+
+    MirrorAverage(trajectory.metadata.bounds).next_states(
+        recorded, [replace(state, gravity=torch.zeros_like(state.gravity), boundary=floor)]
+    )
+    assert len(seen) == 2 ** (state.dim - 1)
+    assert len(floor.pos) > 0 and all((image.boundary.normal[:, 1] > 0.9).all() for image in seen)
 
 
 def test_checkpoints_store_it(scene: tuple[LearnedSimulator, Trajectory], tmp_path: Path) -> None:
