@@ -4,7 +4,7 @@ All of them are exact: the image of a window, with its walls, is a window that t
 
 - A mirror image maps the domain onto itself.
 - A rotation turns walls along with the scene, so the walls of its image are oblique.
-- The vertical is the axis of gravity; without gravity, the axis along which all walls face one way (``trajectory.reflection.level_axes``).
+- The vertical is the axis of gravity; without gravity, the axis along which walls face mostly one way (``trajectory.reflection.level_axes``).
 - Quarter turns rotate gravity along with the scene. A model that never saw another direction of gravity may have learned which way is down.
 - A frame of reference that moves (Galilean shift) adds one velocity to everything. Walls that were at rest then move, because friction and contact depend on
   velocities relative to walls. Without moving walls the image would be wrong wherever a wall is near.
@@ -63,8 +63,8 @@ class Augmentation:
         metadata = trajectory.metadata
         if self.rotate and (metadata.dim != 3 or len(_level(trajectory)) < 2):
             raise AugmentationError(
-                "training.rotate=true: needs scenes in 3D with gravity along one axis, or without gravity and with walls that face one way along one axis "
-                "at most; choose training.mirror=true"
+                "training.rotate=true: needs scenes in 3D with gravity along one axis, or without gravity and with walls that face mostly one way along "
+                "one axis at most; choose training.mirror=true"
             )
         if self.rotate and "sliding" in (metadata.loads or ()):
             raise AugmentationError(

@@ -16,15 +16,15 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 Array = Any
 
-FACES_ALONG = 0.9
-"""A wall faces along an axis if this component of its normal is larger."""
+ONE_WAY = 0.1
+"""Walls face one way along an axis if the sum of this component of their normals exceeds this fraction of the sum of its sizes; it is 0 for closed surfaces."""
 
 
 def level_axes(gravity: Sequence[float], normal: Array) -> list[int]:
     """Return the axes along which a scene may be mirrored and moved: those without gravity.
 
-    Without any gravity, an axis along which all walls face one way counts as the vertical and is left out. Data may store no gravity because another force
-    balances it, as in liquids that fall at their terminal velocity; their scenes still have a floor, and no ceiling.
+    Without any gravity, an axis along which walls face mostly one way counts as the vertical and is left out. Data may store no gravity because another force
+    balances it, as in liquids that fall at their terminal velocity; their scenes still have a floor, and no ceiling. Obstacles in a scene face both ways.
 
     Args:
         gravity: gravity [dim] in m/s².
@@ -32,8 +32,8 @@ def level_axes(gravity: Sequence[float], normal: Array) -> list[int]:
     """
     if any(float(pull) != 0 for pull in gravity):
         return [axis for axis, pull in enumerate(gravity) if float(pull) == 0]
-    faces = [(bool((normal[:, axis] > FACES_ALONG).any()), bool((normal[:, axis] < -FACES_ALONG).any())) for axis in range(len(gravity))]
-    return [axis for axis, (up, down) in enumerate(faces) if up == down]
+    sums = [(float(abs(component.sum())), float(abs(component).sum())) for component in normal.T]
+    return [axis for axis, (all_in_all, sizes) in enumerate(sums) if all_in_all <= ONE_WAY * sizes]
 
 
 class Isometry(Protocol):

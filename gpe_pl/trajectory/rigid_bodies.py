@@ -31,8 +31,8 @@ SMALL = 1e-14
 """Newton's method ends at this change of the quaternion."""
 INSIDE = 1 - 1e-6
 """Newton's method stays below this fraction of the limit. At the limit itself its slope has no inverse."""
-NUM_HALVINGS = 20
-"""Number of halvings of the interval in which the largest possible fraction of an angular momentum is searched for."""
+NUM_HALVINGS = 10
+"""Number of halvings of the interval in which the largest possible fraction of an angular momentum is searched for, which gives it to a thousandth."""
 NO_INERTIA = 1e-12
 """Fraction of the moment of inertia that is added along all axes. Bodies in a row, and single nodes, have none along some."""
 TINY = 1e-300
@@ -120,7 +120,7 @@ def _turned_in_space(arm: Array, weight: Array, way: Array) -> Array:
     inertia = (1 + NO_INERTIA) * trace * one - second
     wanted = xp.sum(weight * _cross(arm, way), axis=0) / 2
     q, is_solved = _solved(xp.linalg.solve(inertia, wanted[:, None])[:, 0], wanted, inertia)
-    if not is_solved:  # no rotation up to the limit has this angular momentum
+    if not is_solved and bool(xp.all(xp.isfinite(wanted))):  # no rotation up to the limit has this angular momentum
         q, low, high = 0 * wanted, 0.0, 1.0
         for _ in range(NUM_HALVINGS):
             middle = (low + high) / 2

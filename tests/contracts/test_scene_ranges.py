@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpe_pl.data.augmentation import Augmentation, turned_with_gravity
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.importers.source import joined
@@ -26,7 +27,7 @@ from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import STICKY
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
-from gpe_pl.trajectory.scene_ranges import described, scene_range, united
+from gpe_pl.trajectory.scene_ranges import described, outside, scene_range, united
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import read_trajectory, trajectory_names, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -211,6 +212,15 @@ def test_the_range_is_that_of_all_training_trajectories(store: Path) -> None:
     assert (low[:2] == high[:2]).all() and tuple(low[:2]) == calm.metadata.gravity
     assert (low[3], high[3]) == (0.0, 0.25)
     assert (low[4], high[4]) == (0.0, 3.0)
+    turned = TrajectoryDataModule(
+        store, GraphConfig(history=2), Noise(0.0, 0.5), BatchSize(2), seed=1, augmentation=Augmentation(quarter_turns=True)
+    )
+    low, high = turned.trained_scene()
+    down = max(map(abs, calm.metadata.gravity))
+    np.testing.assert_allclose([low[:2], high[:2]], [[-down, -down], [down, down]])
+    image = turned_with_gravity(calm, 1)
+    scene = scene_range(np.asarray(image.metadata.gravity), image.boundary, image.metadata.periodicity)
+    assert not [*outside(np.stack([low, high]), scene, 1.0)]
 
 
 @pytest.mark.parametrize("name", names())

@@ -26,6 +26,7 @@ class LearningSet:
         source: its folder in the user's folder.
         origin: where to get it.
         format: format of ``convert``.
+        digest: digest of the published files (``suite.digest_of``); None accepts any.
         num_trajectories, num_frames, materials: number of trajectories, number of frames of each, and materials after the import. Figures on other files would
             not be comparable.
         start: frame of the stored trajectory at which rollouts start.
@@ -39,6 +40,7 @@ class LearningSet:
     source: str
     origin: str
     format: Format
+    digest: str | None
     num_trajectories: int
     num_frames: int
     materials: frozenset[str]
@@ -61,6 +63,7 @@ SETS: dict[SetName, LearningSet] = {
         "database_beam",
         "data/database_beam of github.com/quercushernandez/ThermodynamicsGNN",
         "thermognn",
+        digest="aa3b401f5e733ff7848ec866180fa01640144f1e07d1f4e5ebba1fed9908f77f",
         num_trajectories=52,
         num_frames=22,
         materials=frozenset({"elastomer"}),
@@ -73,6 +76,7 @@ SETS: dict[SetName, LearningSet] = {
         "data_FluidFall",
         "data/data_FluidFall of github.com/YunzhuLi/DPI-Net",
         "dpinet",
+        digest="ee995f4f3a30ba36caf9215edaa77fa96d86495d588a51297ec6bbd80a9dbb99",
         num_trajectories=5,
         num_frames=121,
         materials=frozenset({"fluid"}),
@@ -85,6 +89,7 @@ SETS: dict[SetName, LearningSet] = {
         "data_BoxBath",
         "data/data_BoxBath of github.com/YunzhuLi/DPI-Net",
         "dpinet",
+        digest="473ee8b75a162378468fd8875d3beae5421b5557b234206b0a7828d35e649964",
         num_trajectories=5,
         num_frames=151,
         materials=frozenset({"fluid", "solid"}),
@@ -95,6 +100,7 @@ SETS: dict[SetName, LearningSet] = {
         "data_RigidFall/demo",
         "data/data_RigidFall of github.com/YunzhuLi/VGPL-Dynamics-Prior",
         "dpinet",
+        digest="d9e07aaa207846089af6122d5f06eb65c419d4feff9647ed0112933e5dd78ebf",
         num_trajectories=10,
         num_frames=151,
         materials=frozenset({"solid"}),
@@ -105,6 +111,7 @@ SETS: dict[SetName, LearningSet] = {
         "data_RiceGrip",
         "data/data_RiceGrip of github.com/YunzhuLi/DPI-Net",
         "dpinet",
+        digest="29a4fa152ae7860ece0d4695dcdd0d0038c1dc638ef51c808abdd4e92da672f9",
         num_trajectories=5,
         num_frames=41,
         materials=frozenset({"snow"}),

@@ -6,6 +6,7 @@ Each training is a process of ``python -m gpe_pl.fit``. A command that was stopp
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -86,9 +87,9 @@ def run(settings: Settings, folder: Path) -> tuple[list[dict[str, Any]], str]:
 
 
 def digest_of(source: Path) -> str:
-    """Return a digest of the names and contents of all files in a folder."""
+    """Return a digest of the names and contents of the files of a data set, which are ``{name}_{number}.pt`` or ``{number}.h5``. Others do not count."""
     found = sha256()
-    for path in sorted(path for path in source.rglob("*") if path.is_file()):
+    for path in sorted(path for path in source.rglob("*") if re.fullmatch(r"(\w+_)?[0-9]+\.(pt|h5)", path.name)):
         found.update(f"{path.relative_to(source).as_posix()}\0{sha256(path.read_bytes()).hexdigest()}\n".encode())
     return found.hexdigest()
 
@@ -119,7 +120,10 @@ def imported(name: SetName, label: str, splits: Mapping[str, Any], source: Path,
         return dataset
     replace_text(stored, digest + "\n")
     report = import_dataset(folder / "data", ImportSettings(learning_set.format, str(files), name=dataset, **splits))
-    if fault := _fault(report, learning_set):
+    fault = _fault(report, learning_set)
+    if not fault and learning_set.digest not in (None, digest):
+        fault = "has as many trajectories and frames as the data set, and other values"
+    if fault:
         rmtree(root)
         raise LearningSetError(f"{files}: {fault}; its figures would not be comparable. Get the files of {learning_set.origin}")
     return dataset

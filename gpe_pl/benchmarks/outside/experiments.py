@@ -121,18 +121,24 @@ def measured_fronts(path: Path) -> list[Curve]:
     found: dict[str, list[tuple[float, float]]] = {}
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file)
-            if lacking := {"series", "T", "Z"} - {*(rows.fieldnames or ())}:
-                raise OutsideError(f"{path}: has no column {min(lacking)}; expected the columns series, T and Z")
-            for row in rows:
-                point = float(row["T"]), float(row["Z"])
-                if not np.isfinite(point).all():
-                    raise OutsideError(f"{path}: line {rows.line_num}: T and Z are {point[0]} and {point[1]}, must be finite numbers")
-                found.setdefault(row["series"], []).append(point)
+            names, *rows = list(csv.reader(file)) or [[]]
     except UnicodeDecodeError as error:
         raise OutsideError(f"{path}: is not UTF-8 ({error.reason} at byte {error.start})") from None
-    except (ValueError, TypeError) as error:
-        raise OutsideError(f"{path}: line {rows.line_num}: T and Z must be numbers ({error})") from None
+    except csv.Error as error:
+        raise OutsideError(f"{path}: is not a table of comma-separated values ({error})") from None
+    if wrong := next((name for name in ("series", "T", "Z") if names.count(name) != 1), None):
+        raise OutsideError(f"{path}: has {names.count(wrong)} columns {wrong}; expected the columns series, T and Z once each")
+    for number, row in enumerate(rows, 2):
+        if not row:
+            continue
+        values = dict(zip(names, row, strict=False))
+        try:
+            point = float(values["T"]), float(values["Z"])
+        except (KeyError, ValueError):
+            point = np.nan, np.nan
+        if not (np.isfinite(point).all() and values.get("series")):
+            raise OutsideError(f"{path}: line {number}: {','.join(row)[:100]!r}: expected a series, and finite numbers T and Z")
+        found.setdefault(values["series"], []).append(point)
     if not found:
         raise OutsideError(f"{path}: has no rows")
     return [Curve(series, *np.array(sorted(points)).T) for series, points in found.items()]

@@ -70,7 +70,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     """Return the data set at ``path`` in the format of this module.
 
     Raises:
-        ImportFailure: there are no such folders, or they hold no rollouts.
+        ImportFailure: there are no such folders, they hold no rollouts, or as many of one environment as of another.
     """
     folders, warnings = split_folders(path)
     if not folders and path.is_dir() and any(p.is_dir() for p in _numbered(path, "")):
@@ -82,7 +82,11 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         raise ImportFailure(f"{path}: train and valid hold no rollouts, which are folders with numbers as names")
     environments = {rollout: _environment(rollout) for found in rollouts.values() for rollout in found}
     known = Counter(environment for environment in environments.values() if environment is not None)
-    usual = known.most_common(1)[0][0] if known else "fall"
+    (usual, count), *others = known.most_common(2) or [("fall", 0)]
+    if others and others[0][1] == count:
+        raise ImportFailure(
+            f"{path}: holds {count} rollouts each of {NAMES[usual]} and {NAMES[others[0][0]]}; put each into a folder of its own"
+        )
     sides = SIDES.get(usual, ("y_low",))
     walls = f"walls {', '.join(sides)} at the extremes of all positions, the ground at most at y = 0, friction {GROUND_FRICTION:g}: none is in the source"
     notes = [*([walls] if sides else []), "frame_dt = 1/60 s is the format's, not in the files"]
@@ -123,11 +127,11 @@ def _load(rollout: Path, environment: str | None, usual: str, facts: Facts) -> L
     if not files or wrong is not None:
         raise Refusal(f"has no {wrong or 0}.h5", wrong or 0)
     arrays: dict[str, list[np.ndarray]] = {"positions": [], "velocities": [], "shape_quats": []}
-    scene, has_clusters = np.empty(0), False
+    scene, num_clusters = np.empty(0), 0
     for k, path in enumerate(files):
         try:
             with hdf5.opened(path) as file:
-                has_clusters = has_clusters or is_named(file, "clusters")
+                num_clusters += is_named(file, "clusters")
                 for name, found in arrays.items():
                     if name == "positions" or is_named(file, name):
                         found.append(hdf5.array(file, name, "node, component", "f"))
@@ -142,11 +146,13 @@ def _load(rollout: Path, environment: str | None, usual: str, facts: Facts) -> L
     for name, found in arrays.items():
         if found and len(found) != len(files):
             raise Refusal(f"has {name} in {len(found)} of {len(files)} frames")
+    if num_clusters not in (0, len(files)):
+        raise Refusal(f"has clusters in {num_clusters} of {len(files)} frames")
     pos, vel, quats = (np.stack(found) if found else None for found in arrays.values())
     assert pos is not None
     if vel is not None and vel.shape != pos.shape:
         raise Refusal(f"velocities is {list(vel.shape[1:])}, expected {list(pos.shape[1:])}")
-    nodes = _nodes(pos, vel, quats, scene, has_clusters)
+    nodes = _nodes(pos, vel, quats, scene, num_clusters > 0)
     if environment != usual:
         raise Refusal(f"is of {NAMES[environment or 'fall']}, most rollouts are of {NAMES[usual]}; put it into a folder of its own")
     return build(replace(nodes, ground=0.0), facts)

@@ -15,8 +15,6 @@ from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.trajectory import Trajectory
 
-FLIGHT_FRAMES = 50
-"""Number of frames of each sampled trajectory in which groups in free flight are searched for."""
 FRAMES_SAMPLED = 3
 """Number of frames of each sampled trajectory, evenly spread, in which neighbours are counted."""
 
@@ -45,8 +43,8 @@ def speed_and_acceleration(sample: Sequence[Trajectory]) -> tuple[float, list[fl
     return fastest, np.mean(means, axis=0).tolist()
 
 
-def free_flight_of(trajectory: Trajectory, facts: Facts) -> FreeFlight:
-    """Find the groups in free flight of a trajectory, in the precision of its source.
+def free_flight_of(trajectory: Trajectory, facts: Facts, num_frames: int) -> FreeFlight:
+    """Find the groups in free flight of a trajectory in at most ``num_frames`` frames, in the precision of its source.
 
     Walls at bounds that are not known yet are at those of the trajectory. Without them, nodes that lie on the ground would count as free.
     """
@@ -56,4 +54,4 @@ def free_flight_of(trajectory: Trajectory, facts: Facts) -> FreeFlight:
     arrays = {"pos": trajectory.pos, "mass": trajectory.mass, "boundary_pos": b.pos[None] if b.motion is None else b.motion.pos}
     given = {"cells": trajectory.cells, "prescribed_axes": trajectory.prescribed, "force": trajectory.force}
     arrays |= {name: values for name, values in given.items() if values is not None}
-    return joined(free_flights(trajectory.metadata, arrays, FLIGHT_FRAMES), trajectory.metadata.dim)
+    return joined(free_flights(trajectory.metadata, arrays, num_frames), trajectory.metadata.dim)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gpe_pl.data.free_flight import FreeFlight, joined, vector
+from gpe_pl.data.free_flight import FreeFlight, vector
 from gpe_pl.data.importers.report import Event
 from gpe_pl.data.importers.sampled import free_flight_of
 from gpe_pl.data.importers.source import Facts, Item, Loaded, Refusal
@@ -22,9 +22,9 @@ from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from gpe_pl.trajectory.values import faults, size_conflicts
 
 NUM_SAMPLED = 8
-"""Number of trajectories from which spacing, neighbours and free flight are measured. Training trajectories come first."""
-MOST_FLIGHTS = 4 * NUM_SAMPLED
-"""Free flight is measured in so many trajectories if they have different gravity."""
+"""Number of trajectories from which spacing, radius and neighbours are measured. Training trajectories come first."""
+FLIGHT_FRAMES, FEW_FLIGHT_FRAMES = 50, 16
+"""Numbers of frames of each of the first ``NUM_SAMPLED`` trajectories, and of each later one, in which groups in free flight are searched for."""
 ENOUGH_OF_ONE = 5
 """Number of groups in free flight, over the examined frames of one trajectory, that can tell that its gravity is wrong."""
 LONG_ENOUGH = HISTORY + 2
@@ -61,7 +61,7 @@ class Survey:
         assumes_gravity: for each trajectory, whether its gravity is only assumed to be the usual one of the format.
         suspects: warnings about trajectories.
         num_bytes: size of all arrays.
-        flights: groups in free flight of each sampled trajectory.
+        flights: groups in free flight of each trajectory.
         common: frame interval [s], dimension and periodic axes of all trajectories.
     """
 
@@ -106,8 +106,9 @@ class Survey:
             raise Refusal("nothing moves")
         deformation = 0.0 if trajectory.rigid_body is None else rigid_deformation(trajectory, trajectory.num_frames - 1)
         if deformation > DEFORMED:
+            wide = ", or it is wider than half a period" if any(m.periodic) else ""
             raise Refusal(
-                f"rigid_body: distances in a body change by {deformation:.3g} of its size, so it is not rigid; leave rigid_body out"
+                f"rigid_body: distances in a body change by {deformation:.3g} of its size, so it is not rigid{wide}; leave rigid_body out"
             )
         digest = _digest(trajectory.pos)
         if self.scenes.setdefault(digest, where) != where:
@@ -127,7 +128,8 @@ class Survey:
         if len(at_one_place):
             what = f"{len(at_one_place)} nodes are at the place of another node, the first is node {at_one_place[0]}: do bodies overlap?"
             self.suspects.append(Event(split, name, 0, what))
-        self.nearest.append((split, name, float(np.median(nearest))))
+        there = nearest if trajectory.alive is None else nearest[trajectory.alive[0]]
+        self.nearest.append((split, name, float(np.median(there)) if len(there) else np.inf))
         self.lengths.append((split, name, trajectory.num_frames))
         self.materials |= set(m.materials)
         self.columns |= set(m.param_names)
@@ -135,9 +137,8 @@ class Survey:
         self.stressed |= set(m.with_stress if trajectory.stress is not None else ())
         self.num_bytes += sum(array.nbytes for array in arrays.values())
         self.bounds.append(m.bounds)
-        has_other_gravity = all(flight.gravity != m.gravity for flight in self.flights)
-        if len(self.flights) < NUM_SAMPLED or (has_other_gravity and len(self.flights) < MOST_FLIGHTS):
-            self.flights.append(Flight(split, name, m.gravity, loaded.assumes_gravity, free_flight_of(trajectory, facts)))
+        num_frames = FLIGHT_FRAMES if len(self.flights) < NUM_SAMPLED else FEW_FLIGHT_FRAMES
+        self.flights.append(Flight(split, name, loaded.assumes_gravity, free_flight_of(trajectory, facts, num_frames)))
         if len(self.spacings) < NUM_SAMPLED:
             self.spacings.append(m.spacing)
             self.radii.append(m.connectivity_radius)
@@ -146,9 +147,10 @@ class Survey:
 
     def look_for_outliers(self) -> None:
         """Add suspects: trajectories whose distances, length or free flight differ from those of the others."""
-        usual = float(np.median([distance for _, _, distance in self.nearest]))
-        for split, name, distance in self.nearest:
-            if np.isfinite(usual) and not usual / SPACING_RATIO <= distance <= usual * SPACING_RATIO:
+        known = [(split, name, distance) for split, name, distance in self.nearest if 0 < distance < np.inf]
+        usual = float(np.median([distance for _, _, distance in known])) if known else np.inf
+        for split, name, distance in known:
+            if not usual / SPACING_RATIO <= distance <= usual * SPACING_RATIO:
                 what = f"nodes are {distance:.4g} m from the nearest one, in the median of all trajectories {usual:.4g} m: is its unit of length another?"
                 self.suspects.append(Event(split, name, 0, what))
         ((length, count),) = Counter(length for _, _, length in self.lengths).most_common(1)
@@ -156,18 +158,17 @@ class Survey:
             if own < length and count >= USUAL * len(self.lengths):
                 self.suspects.append(Event(split, name, -1, f"has {own} frames, most trajectories have {length}: was it cut off?"))
 
-    def look_for_wrong_gravity(self, assumed: tuple[float, ...] | None, dim: int) -> None:
-        """Add suspects: sampled trajectories whose groups in free flight accelerate in another way than their gravity, while those of the others agree with it.
+    def look_for_wrong_gravity(self, assumed: tuple[float, ...] | None) -> None:
+        """Add suspects: trajectories whose groups in free flight accelerate in another way than their gravity, while those of the others agree with it.
 
         Args:
             assumed: gravity [dim] in m/s² of the trajectories that do not state it.
-            dim: dimension of space.
         """
         flights = [f.free.under(assumed) if f.assumed and assumed is not None else f.free for f in self.flights]
-        for k, (f, free) in enumerate(zip(self.flights, flights, strict=True)):
-            others = joined(flights[:k] + flights[k + 1 :], dim)
-            confirmed = 2 * others.num_disturbed < others.num_free
-            if confirmed and free.num_free >= ENOUGH_OF_ONE and free.agrees_on_another:
+        num_free, num_disturbed = (sum(getattr(free, name) for free in flights) for name in ("num_free", "num_disturbed"))
+        for f, free in zip(self.flights, flights, strict=True):
+            others_agree = 2 * (num_disturbed - free.num_disturbed) < num_free - free.num_free
+            if others_agree and free.num_free >= ENOUGH_OF_ONE and free.agrees_on_another:
                 stored = vector(np.median(free.gravity, axis=0))
                 what = f"gravity is stored as {stored}, but {free.num_free} groups in free flight agree on {vector(free.typical)}"
                 self.suspects.append(Event(f.split, f.name, -1, what))
@@ -179,14 +180,12 @@ class Flight:
 
     Attributes:
         split, name: the trajectory.
-        gravity: its gravity [dim] in m/s².
-        assumed: whether this is only assumed.
+        assumed: whether its gravity is only assumed.
         free: the groups.
     """
 
     split: str
     name: str
-    gravity: tuple[float, ...]
     assumed: bool
     free: FreeFlight
 

@@ -93,7 +93,7 @@ def test_one_seed_and_trajectory_have_no_interval() -> None:
 @pytest.fixture
 def falls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with rollouts in the layout of FluidFall, shorter than the published ones."""
-    monkeypatch.setitem(SETS, "fluidfall", replace(SETS["fluidfall"], num_frames=14))
+    monkeypatch.setitem(SETS, "fluidfall", replace(SETS["fluidfall"], num_frames=14, digest=None))
     for k in range(5):
         pos = sources.motion(14, dim=3, seed=k)
         sources.dpinet(tmp_path / "files" / "data_FluidFall" / "valid" / str(k), pos, np.gradient(pos, 1 / 60, axis=0))
@@ -152,6 +152,21 @@ def exchange(folder: Path) -> None:
     for k in range(5):
         pos = sources.rigid(sources.motion(14, num_nodes=80, dim=3, seed=k), slice(0, 64))
         sources.dpinet(folder / str(k), pos, np.gradient(pos, 1 / 60, axis=0), clusters=np.zeros((1, 64), int))
+
+
+def test_files_with_other_values_than_the_published_ones_are_refused(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = falls / "data_FluidFall"
+    monkeypatch.setitem(SETS, "fluidfall", replace(SETS["fluidfall"], digest=suite.digest_of(files)))
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
+    settings = suite.Settings(str(falls), only=["fluidfall"], num_splits=1)
+    (files / ".DS_Store").write_bytes(b"a file of the desktop")
+    with pytest.raises(suite.LearningSetError, match="failed"):  # its training
+        suite.run(settings, tmp_path / "runs")
+    pos = 10 * sources.motion(14, dim=3, seed=2)
+    rmtree(files / "valid" / "2")
+    sources.dpinet(files / "valid" / "2", pos, np.gradient(pos, 1 / 60, axis=0))
+    with pytest.raises(suite.LearningSetError, match="has as many trajectories and frames as the data set, and other values"):
+        suite.run(settings, tmp_path / "others")
 
 
 @pytest.mark.parametrize(

@@ -43,18 +43,21 @@ def test_fronts_are_read_by_series_and_in_order(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (b"time,front\n1,2\n", "has no column T; expected the columns series, T and Z"),
-        (b"series;T;Z\na;0;1\n", "has no column T"),
-        (b"", "has no column T"),
-        (b"series,T,Z\n", "has no rows"),
-        (b"series,T,Z\na,0,1\na,nan,2\n", "line 3: T and Z are nan and 2.0, must be finite numbers"),
-        (b"series,T,Z\na,0\n", "line 2: T and Z must be numbers"),
-        (b"series,T,Z\na,0,x\n", "line 2: T and Z must be numbers .could not convert string to float: 'x'"),
+        (b"time,front\n1,2\n", "f.csv: has 0 columns series; expected the columns series, T and Z once each"),
+        (b"series;T;Z\na;0;1\n", "has 0 columns series"),
+        (b"", "has 0 columns series"),
+        (b"series,T,Z,Z\na,0,1,2\n", "has 2 columns Z"),
+        (b"series,T,Z\n", "f.csv: has no rows"),
+        (b"series,T,Z\na,0,1\na,nan,2\n", "f.csv: line 3: 'a,nan,2': expected a series, and finite numbers T and Z"),
+        (b"series,T,Z\na,0\n", "f.csv: line 2: 'a,0': expected"),
+        (b"series,T,Z\na,0,x\n", "f.csv: line 2: 'a,0,x': expected"),
+        (b"T,Z,series\n1,2\n", "f.csv: line 2: '1,2': expected a series"),
+        (b"series,T,Z\na,0," + 200_000 * b"1" + b"\n", "f.csv: is not a table of comma-separated values"),
         (b"series,T,Z\n\xe9,0,1\n", "is not UTF-8"),
     ],
 )
 def test_damaged_files_of_fronts_are_refused(tmp_path: Path, content: bytes, says: str) -> None:
-    path = tmp_path / DAM_BREAK_FILE
+    path = tmp_path / "f.csv"
     path.write_bytes(content)
     with pytest.raises(OutsideError, match=says):
         measured_fronts(path)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gpe_pl.data.importers import ImportFailure
 from gpe_pl.trajectory.boundary import BoundaryMotion
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests import sources
@@ -127,3 +128,12 @@ def test_a_rollout_of_another_environment_is_refused(tmp_path: Path) -> None:
         "train, train/1: is of BoxBath, most rollouts are of FluidFall; put it into a folder of its own"
     ]
     assert stored["train"][0].metadata.materials == ("fluid",)
+
+
+def test_rollouts_that_are_not_of_one_environment_are_refused(tmp_path: Path) -> None:
+    for k in range(2):
+        pos = rigid(motion(num_nodes=80, dim=3, seed=k), slice(0, 64))
+        extra = {"clusters": np.zeros((1, 64), int)} if k else {}
+        sources.dpinet(tmp_path / "both" / "train" / str(k), pos, np.gradient(pos, FRAME_DT, axis=0), **extra)
+    with pytest.raises(ImportFailure, match=r"holds 1 rollouts each of FluidFall and BoxBath; put each into a folder of its own"):
+        imported(tmp_path, tmp_path / "both", "dpinet")

@@ -92,3 +92,16 @@ def test_numbers_of_bodies_that_do_not_fit_are_refused(number: int) -> None:
         checked_bodies(np.array([0, 0, number]), 3)
     np.testing.assert_array_equal(checked_bodies(np.array([2**31 - 1, -1]), 2), [2**31 - 1, -1])
     np.testing.assert_array_equal(checked_bodies(np.array([3], np.uint8), 1), [3])
+
+
+def test_a_trajectory_of_one_node_has_no_spacing_to_suspect(tmp_path: Path) -> None:
+    lonely = {**flying(5), "pos": flying(5)["pos"][:, :1]}
+    assert not any("unit of length" in w for w in warnings(tmp_path, [*(flying(k) for k in range(5)), lonely]))
+
+
+def test_wrong_motion_is_noticed_in_late_trajectories_too(tmp_path: Path) -> None:
+    time = DT * np.arange(LANDS)[:, None, None]
+    fast = flying(9)
+    fast["pos"][:LANDS] += np.array([0.0, 1.5 * GRAVITY]) * time**2
+    (what,) = [w for w in warnings(tmp_path, [*(flying(k) for k in range(12)), fast]) if "gravity" in w]
+    assert ", 12.npz: gravity is stored as (0, -9.81) m/s², but" in what
