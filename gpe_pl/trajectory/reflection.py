@@ -16,8 +16,8 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 Array = Any
 
-ONE_WAY = 0.1
-"""Walls face one way along an axis if the sum of this component of their normals exceeds this fraction of the sum of its sizes; it is 0 for closed surfaces."""
+ONE_WAY = 0.05
+"""Walls face mostly one way along an axis if the mean of this component of their normals is larger. The mean is 0 over closed surfaces."""
 
 
 def level_axes(gravity: Sequence[float], normal: Array) -> list[int]:
@@ -32,8 +32,7 @@ def level_axes(gravity: Sequence[float], normal: Array) -> list[int]:
     """
     if any(float(pull) != 0 for pull in gravity):
         return [axis for axis, pull in enumerate(gravity) if float(pull) == 0]
-    sums = [(float(abs(component.sum())), float(abs(component).sum())) for component in normal.T]
-    return [axis for axis, (all_in_all, sizes) in enumerate(sums) if all_in_all <= ONE_WAY * sizes]
+    return [axis for axis in range(len(gravity)) if abs(float(normal[:, axis].sum())) <= ONE_WAY * normal.shape[0]]
 
 
 class Isometry(Protocol):
