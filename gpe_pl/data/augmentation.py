@@ -99,6 +99,17 @@ class Augmentation:
             trajectory = turned_with_gravity(trajectory, int(number))
         return trajectory
 
+    def extremes(self, trajectory: Trajectory) -> list[Trajectory]:
+        """Return a trajectory and its images that widen the range of scenes in training: with the fastest walls, and with all directions of gravity."""
+        images = [trajectory]
+        if self.boost_speed > 0:
+            velocity = np.zeros(trajectory.metadata.dim)
+            velocity[_level(trajectory)] = self.boost_speed
+            images.append(boosted(trajectory, velocity, 0))
+        if self.quarter_turns:
+            images = [turned_with_gravity(image, number) for image in images for number in range(NUM_TURNS[trajectory.metadata.dim])]
+        return images
+
 
 def turned_with_gravity(trajectory: Trajectory, number: int) -> Trajectory:
     """Return a trajectory turned about the middle of its domain, with its gravity and bounds; see ``Rotation.between_axes``."""

@@ -15,7 +15,7 @@ import torch
 from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
 
-from gpe_pl.data.augmentation import NUM_TURNS, Augmentation, turned_with_gravity
+from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.dataset import (
     CachedGraphs,
@@ -284,10 +284,10 @@ class TrajectoryDataModule(L.LightningDataModule):
     def trained_scene(self) -> np.ndarray:
         """Return the range [2, channel] of gravity and boundary nodes over all training trajectories; see ``trajectory.scene_ranges``.
 
-        With ``quarter_turns``, it includes all directions of gravity in which the trajectories are seen.
+        It includes the speeds of walls and the directions of gravity in images of the trajectories.
         """
-        turns = range(NUM_TURNS[self.metadata.dim] if self.train_set.augmentation.quarter_turns else 1)
-        return united(_scene(stored, turn) for stored in self.train_set.trajectories for turn in turns)
+        augmentation = self.train_set.augmentation
+        return united(_scene(image) for stored in self.train_set.trajectories for image in augmentation.extremes(_whole(stored)))
 
     def trained_scales(self) -> torch.Tensor:
         """Return the range of spacings and frame intervals; see ``training_ranges.scale_range``."""
@@ -336,9 +336,11 @@ def _set_up_worker(_: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, but training needs its workers until it has saved
 
 
-def _scene(stored: StoredTrajectory, turn: int) -> np.ndarray:
+def _whole(stored: StoredTrajectory) -> Trajectory:
+    """Return a trajectory with all of the boundary's motion; its first frame alone if the boundary does not move."""
     first = stored.window(0, 1)
-    whole = first if first.boundary.motion is None else stored.window(0, stored.num_frames)
-    if turn:
-        first, whole = turned_with_gravity(first, turn), turned_with_gravity(whole, turn)
-    return scene_range(np.asarray(first.metadata.gravity), whole.boundary, first.metadata.periodicity)
+    return first if first.boundary.motion is None else stored.window(0, stored.num_frames)
+
+
+def _scene(trajectory: Trajectory) -> np.ndarray:
+    return scene_range(np.asarray(trajectory.metadata.gravity), trajectory.boundary, trajectory.metadata.periodicity)

@@ -221,6 +221,10 @@ def test_the_range_is_that_of_all_training_trajectories(store: Path) -> None:
     image = turned_with_gravity(calm, 1)
     scene = scene_range(np.asarray(image.metadata.gravity), image.boundary, image.metadata.periodicity)
     assert not [*outside(np.stack([low, high]), scene, 1.0)]
+    boosted = TrajectoryDataModule(
+        store, GraphConfig(history=2), Noise(0.0, 0.5), BatchSize(2), seed=1, augmentation=Augmentation(boost_speed=5.0)
+    )
+    assert boosted.trained_scene()[:, 4].tolist() == [0.0, 8.0]  # the wall that moved along x already
 
 
 @pytest.mark.parametrize("name", names())
