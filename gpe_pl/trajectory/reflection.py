@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import permutations, product
 from typing import Any, Protocol
 
@@ -159,11 +160,7 @@ class Rotation(Isometry):
     @classmethod
     def between_axes(cls, number: int, centre: Sequence[float]) -> Rotation:
         """Return one of the rotations about a point [dim] in m that map axes onto axes: 4 in 2D, 24 in 3D, numbered from 0, the identity."""
-        dim = len(centre)
-        signed = (
-            np.eye(dim)[list(order)] * np.array(signs) for order in permutations(range(dim)) for signs in product((1.0, -1.0), repeat=dim)
-        )
-        return cls([matrix for matrix in signed if np.linalg.det(matrix) > 0][number], np.asarray(centre, float))
+        return cls(_between_axes(len(centre))[number], np.asarray(centre, float))
 
     def vector(self, x: Array) -> Array:
         """Return the images of vectors [..., dim]."""
@@ -180,6 +177,15 @@ class Rotation(Isometry):
         turned = self.matrix @ x[..., places].reshape(*x.shape[:-1], dim, dim) @ self.matrix.T
         in_plane = turned.reshape(*x.shape[:-1], dim**2)[..., rows]
         return np.concatenate([in_plane, x[..., len(rows) :]], axis=-1).astype(x.dtype)
+
+
+@cache
+def _between_axes(dim: int) -> list[np.ndarray]:
+    """Return the rotations [dim, dim] that map axes onto axes; the first is the identity."""
+    signed = (
+        np.eye(dim)[list(order)] * np.array(signs) for order in permutations(range(dim)) for signs in product((1.0, -1.0), repeat=dim)
+    )
+    return [matrix for matrix in signed if np.linalg.det(matrix) > 0]
 
 
 def _row(values: list[float], like: Any) -> Array:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpe_pl.geometry.periodicity import Periodicity
 from gpe_pl.trajectory.rigid_bodies import bodies_of
 from gpe_pl.trajectory.trajectory import Trajectory
 
 MAX_COMPARED = 64
 """Maximum number of nodes of a body between which distances are compared; they are spread evenly over its rows."""
+FRAMES_AT_ONCE = 100
+"""Number of frames that are compared at a time, to save memory."""
 
 
 def rigid_deformation(trajectory: Trajectory, num_steps: int) -> float:
@@ -23,10 +26,15 @@ def rigid_deformation(trajectory: Trajectory, num_steps: int) -> float:
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, MAX_COMPARED).astype(int))]
         if len(rows) < 2:
             continue
-        pos = trajectory.pos[: num_steps + 1, rows].astype(np.float64)
-        pos = pos[:, :1] + space.shortest(pos - pos[:, :1])
-        first, second = np.triu_indices(len(rows), 1)
-        distances = np.linalg.norm(pos[:, first] - pos[:, second], axis=-1)
-        if (size := distances[0].max()) > 0:
-            largest = max(largest, float(np.abs(distances[1:] - distances[0]).max() / size))
+        before = _distances(trajectory.pos[:1, rows], space)
+        for start in range(1, num_steps + 1, FRAMES_AT_ONCE) if before.max() > 0 else ():
+            after = _distances(trajectory.pos[start : min(start + FRAMES_AT_ONCE, num_steps + 1), rows], space)
+            largest = max(largest, float(np.abs(after - before).max() / before.max()))
     return largest
+
+
+def _distances(pos: np.ndarray, space: Periodicity) -> np.ndarray:
+    """Return the distances [frame, pair] in m between all nodes of a body, given their positions [frame, node, dim]."""
+    arm = space.shortest(pos.astype(np.float64) - pos[:, :1])
+    first, second = np.triu_indices(pos.shape[1], 1)
+    return np.asarray(np.linalg.norm(arm[:, first] - arm[:, second], axis=-1))
