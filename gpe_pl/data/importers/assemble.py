@@ -322,7 +322,8 @@ class _Conversion:
                 "gravity=[…], frame_dt=… or the unit of length may be wrong"
             )
         else:
-            self.survey.look_for_wrong_gravity(None if usual is None else (self.facts.usual_gravity or usual)[:dim])
+            assumed = self.facts.usual_gravity
+            self.survey.look_for_wrong_gravity(None if assumed is None else assumed[:dim])
 
     def _compare_with_rounding(self) -> None:
         """Choose the origin of stored positions (``better_origin``), and warn of trajectories whose rounding error is still large."""
