@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from shutil import rmtree
 from types import SimpleNamespace
@@ -152,6 +153,18 @@ def exchange(folder: Path) -> None:
     for k in range(5):
         pos = sources.rigid(sources.motion(14, num_nodes=80, dim=3, seed=k), slice(0, 64))
         sources.dpinet(folder / str(k), pos, np.gradient(pos, 1 / 60, axis=0), clusters=np.zeros((1, 64), int))
+
+
+def test_the_definition_of_the_digest_is_that_of_the_published_ones(tmp_path: Path) -> None:
+    """A change of the definition would refuse the published files: ``LearningSet.digest`` has to be computed again from them."""
+    for name, content in {"valid/0/0.h5": b"a", "valid/0/1.h5": b"b", "beam_1.pt": b"c", "stat.h5": b"d", "valid/.DS_Store": b"e"}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    lines = [
+        f"{name}\0{sha256(content).hexdigest()}\n"
+        for name, content in (("beam_1.pt", b"c"), ("valid/0/0.h5", b"a"), ("valid/0/1.h5", b"b"))
+    ]
+    assert suite.digest_of(tmp_path) == sha256("".join(lines).encode()).hexdigest()
 
 
 def test_files_with_other_values_than_the_published_ones_are_refused(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
