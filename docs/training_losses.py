@@ -64,7 +64,7 @@ def main(key: str, folder: Path, name: str, note: str) -> None:
     replace_text(target / "losses.csv", "".join(",".join(map(str, row)) + "\n" for row in rows))
     loss, rolled = COLUMNS
     every = sorted({step for seeds in groups.values() for values in seeds.values() for step in values[loss]})
-    shown = [min(every, key=lambda step: abs(step - part * every[-1])) for part in FRACTIONS]
+    shown = [*dict.fromkeys(min(every, key=lambda step: abs(step - part * every[-1])) for part in FRACTIONS)]
     table = [table_row([key, "seeds", *(f"loss at step {step}" for step in shown), f"rollout at step {shown[-1]} [1e-6 m²]"])]
     table.append("|" + "---|" * (len(shown) + 3))
     for variant, seeds in groups.items():
