@@ -23,8 +23,9 @@ from gpe_pl.solvers.materials import lame_parameters
 from gpe_pl.trajectory.state import State
 
 PROGRAM = "ccx"
-INCREMENTS = 20
-"""Time steps of the engine within a frame."""
+ATTEMPTS = ((20, 0.1), (20, 1.0), (60, 1.0))
+"""Time steps of the engine within a frame, and stiffness of sticking contact as a fraction of the penalty, one attempt after the other. With friction,
+the engine stops in some scenes with a message about impacts, and the next attempt may pass."""
 STIFFNESS = 2.0
 """Penalty of contact, as a multiple of Young's modulus over the spacing."""
 SECONDS = 600
@@ -47,14 +48,17 @@ def run(state: State, solver: FEM, num_frames: int) -> np.ndarray:
     Raises:
         EngineError: the engine failed or stopped early; the message has its last lines.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        Path(folder, "scene.inp").write_text(deck(state, solver, num_frames), encoding="ascii")
-        said = output_of("CalculiX", [PROGRAM, "-i", "scene"], Path(folder), SECONDS)
-        table = Path(folder, "scene.dat")
-        frames = displacements(table.read_text(encoding="ascii"), state.num_nodes) if table.is_file() else np.empty((0, state.num_nodes, 2))
-    if len(frames) != num_frames - 1:
-        raise EngineError(f"CalculiX: has {len(frames)} of {num_frames - 1} frames; its last lines are: {last_lines(said)}")
-    return np.concatenate([state.pos[None], state.pos + frames])
+    for increments, sticking in ATTEMPTS:
+        with tempfile.TemporaryDirectory() as folder:
+            Path(folder, "scene.inp").write_text(deck(state, solver, num_frames, increments, sticking), encoding="ascii")
+            said = output_of("CalculiX", [PROGRAM, "-i", "scene"], Path(folder), SECONDS)
+            table = Path(folder, "scene.dat")
+            frames = (
+                displacements(table.read_text(encoding="ascii"), state.num_nodes) if table.is_file() else np.empty((0, state.num_nodes, 2))
+            )
+        if len(frames) == num_frames - 1:
+            return np.concatenate([state.pos[None], state.pos + frames])
+    raise EngineError(f"CalculiX: has {len(frames)} of {num_frames - 1} frames; its last lines are: {last_lines(said)}")
 
 
 def displacements(text: str, num_nodes: int) -> np.ndarray:
@@ -65,8 +69,8 @@ def displacements(text: str, num_nodes: int) -> np.ndarray:
     return values[:, :, 1:3]
 
 
-def deck(state: State, solver: FEM, num_frames: int) -> str:
-    """Return the input file of a scene."""
+def deck(state: State, solver: FEM, num_frames: int, increments: int, sticking: float) -> str:
+    """Return the input file of a scene, with one of ``ATTEMPTS``."""
     cells, pos = np.asarray(state.cells), np.asarray(state.pos)
     count = len(pos)
     mesh = build_mesh(pos, cells, np.asarray(state.mass))
@@ -90,7 +94,7 @@ def deck(state: State, solver: FEM, num_frames: int) -> str:
     wedges = np.concatenate([cells, cells + count], axis=1) + 1
     box = 2 * count + np.array([1, 4, 3, 2, 5, 8, 7, 6])
     skin = np.unique(mesh.edges)
-    step = solver.frame_dt / INCREMENTS
+    step = solver.frame_dt / increments
     lines = ["*NODE, NSET=ALL", *(f"{i}, {x:.12e}, {y:.12e}, {z:.12e}" for i, (x, y, z) in enumerate(nodes, 1))]
     lines += ["*ELEMENT, TYPE=C3D6, ELSET=BODY", *(", ".join(map(str, [i, *wedge])) for i, wedge in enumerate(wedges, 1))]
     lines += ["*ELEMENT, TYPE=C3D8, ELSET=FLOOR", ", ".join(map(str, [len(wedges) + 1, *box]))]
@@ -110,7 +114,7 @@ def deck(state: State, solver: FEM, num_frames: int) -> str:
     ]
     lines += ["*SURFACE INTERACTION, NAME=TOUCH", "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR", f"{stiffness:.9e}"]
     if friction > 0:
-        lines += ["*FRICTION", f"{min(friction, 10.0)}, {stiffness / 10:.9e}"]
+        lines += ["*FRICTION", f"{min(friction, 10.0)}, {sticking * stiffness:.9e}"]
     lines += ["*CONTACT PAIR, INTERACTION=TOUCH, TYPE=NODE TO SURFACE", "SKIN, TOP"]
     lines += ["*BOUNDARY", "SOLID, 3, 3", "FIXED, 1, 3"]
     lines += ["*INITIAL CONDITIONS, TYPE=VELOCITY"]
@@ -120,10 +124,10 @@ def deck(state: State, solver: FEM, num_frames: int) -> str:
     gravity = float(np.linalg.norm(state.gravity))
     direction = np.asarray(state.gravity) / gravity
     lines += [
-        f"*STEP, NLGEOM, INC={10 * INCREMENTS * num_frames}",
+        f"*STEP, NLGEOM, INC={10 * increments * num_frames}",
         "*DYNAMIC, DIRECT",
         f"{step:.9e}, {(num_frames - 1) * solver.frame_dt:.9e}",
     ]
     lines += ["*DLOAD", f"BODY, GRAV, {gravity:.9e}, {direction[0]:.9e}, {direction[1]:.9e}, 0."]
-    lines += [f"*NODE PRINT, NSET=FRONT, FREQUENCY={INCREMENTS}", "U", "*END STEP", ""]
+    lines += [f"*NODE PRINT, NSET=FRONT, FREQUENCY={increments}", "U", "*END STEP", ""]
     return "\n".join(lines)

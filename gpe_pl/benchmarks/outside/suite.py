@@ -66,7 +66,7 @@ def run(settings: Settings, specs: Mapping[str, DatasetSpec], own: Path) -> tupl
     """
     torch.set_num_threads(settings.num_threads)
     folder = Path(settings.folder).expanduser()
-    candidates = [_candidate(checkpoint, specs) for checkpoint in settings.checkpoints]
+    candidates = [candidate_of(checkpoint, specs) for checkpoint in settings.checkpoints]
     records = [record for name in settings.experiments for c in candidates for record in experiments.compared(name, c, folder)]
     present = [name for name in settings.engines if not engines.SCENES[name].is_missing()]
     records += [record for name in present for c in candidates for record in engines.compared(name, c)]
@@ -76,7 +76,12 @@ def run(settings: Settings, specs: Mapping[str, DatasetSpec], own: Path) -> tupl
     return records + [{"learning_set": record} for record in measured], report(records, missing, folder, measured)
 
 
-def _candidate(checkpoint: str, specs: Mapping[str, DatasetSpec]) -> Candidate:
+def candidate_of(checkpoint: str, specs: Mapping[str, DatasetSpec]) -> Candidate:
+    """Return a model with the data set that it was trained on.
+
+    Raises:
+        OutsideError: it was trained on none of ``specs``.
+    """
     simulator = of_stored_frames(checkpoint)
     own = simulator.builder.metadata
     fitting = [s for s in specs.values() if s.name == own.dataset and abs(s.scene.spacing / own.spacing - 1) < 0.01]

@@ -66,7 +66,7 @@ def test_displacements_are_read_by_frame_and_node() -> None:
 
 def test_a_deck_has_the_mesh_twice_its_material_and_its_skin() -> None:
     state = falling_block(0.1, 1.0)
-    lines = calculix.deck(state, FEM(UNIT_SQUARE, 2e-3, poisson_ratio=0.25), 5).splitlines()
+    lines = calculix.deck(state, FEM(UNIT_SQUARE, 2e-3, poisson_ratio=0.25), 5, 20, 0.1).splitlines()
     assert sum(len(line.split(",")) == 7 for line in lines) == len(state.cells)  # type: ignore[arg-type]
     mu = 1e6 / 2.5
     neo_hooke = [float(x) for x in lines[lines.index("*HYPERELASTIC, NEO HOOKE") + 1].split(",")]

@@ -1,0 +1,114 @@
+"""Random scenes of other engines: the same initial state run by the engine and by the solver of a data set.
+
+- ``kratos``: a column of sand at rest on a rough floor collapses, with random width, height, place and friction angle.
+- ``calculix``: a block of a solid falls on a floor, with random size, height, speed and Young's modulus. The engine gives up most blocks that slide.
+- ``splishsplash``: a block of liquid falls into a box, with random size, place, velocity and viscosity.
+
+Values of the material parameter lie in the range that the model was trained on.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.benchmarks.acceptance import scenes
+from gpe_pl.benchmarks.acceptance.trial import Candidate
+from gpe_pl.benchmarks.outside.engine import EngineError
+from gpe_pl.benchmarks.outside.engines import SCENES, EngineName
+from gpe_pl.files.atomic import replacing
+from gpe_pl.geometry.shapes import domain_walls
+from gpe_pl.rollout.loop import rollout
+from gpe_pl.schema import STICKY
+from gpe_pl.solvers.scenes import JITTER, integer_lattice
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
+
+COLUMN_WIDTH, COLUMN_HEIGHT = (8, 20), (10, 28)
+"""Smallest and largest number of particles of a column of sand along each axis."""
+BLOCK_COLUMNS, BLOCK_ROWS = (3, 7), (5, 10)
+"""Smallest and largest half number of columns, and number of rows, of squares of a block."""
+BLOCK_GAP, BLOCK_SPEED = (0.01, 0.08), (0.5, 1.5)
+"""Gap between the block and the floor [m], and its downward speed [m/s]."""
+LIQUID_SIZE, LIQUID_SPEED = (5, 9), 0.5
+"""Smallest and largest number of particles of a block of liquid along each axis, and the largest velocity along each axis [m/s]."""
+
+Start = Callable[[Candidate, float, np.random.Generator], State]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The same scene by an engine and by the solver.
+
+    Attributes:
+        engine: trajectory of the engine, with the mean velocity over the last frame.
+        solver: positions of the solver [frame, node, dim] in m.
+    """
+
+    engine: Trajectory
+    solver: np.ndarray
+
+
+def _column(candidate: Candidate, value: float, rng: np.random.Generator) -> State:
+    spec = candidate.spec
+    low, high = np.array(spec.scene.bounds, float).T
+    counts = np.array([rng.integers(*COLUMN_WIDTH, endpoint=True), rng.integers(*COLUMN_HEIGHT, endpoint=True)])
+    free = (high - low)[0] - counts[0] * spec.scene.spacing
+    corner = low + np.array([rng.uniform(0.2, 0.8) * free, 0.0])
+    lattice = integer_lattice(np.zeros(2, int), counts - 1) + 0.5
+    pos = corner + spec.scene.spacing * (lattice + rng.uniform(-JITTER, JITTER, lattice.shape))
+    return scenes.start(spec, value, pos, np.zeros(2), domain_walls(spec.scene.bounds, STICKY))
+
+
+def _block(candidate: Candidate, value: float, rng: np.random.Generator) -> State:
+    columns, rows = 2 * int(rng.integers(*BLOCK_COLUMNS, endpoint=True)), int(rng.integers(*BLOCK_ROWS, endpoint=True))
+    return scenes.dropped_block(candidate.spec, value, columns, rows, rng.uniform(*BLOCK_GAP), rng.uniform(*BLOCK_SPEED))
+
+
+def _liquid(candidate: Candidate, value: float, rng: np.random.Generator) -> State:
+    spec = candidate.spec
+    low, high = np.array(spec.scene.bounds, float).T
+    counts = rng.integers(*LIQUID_SIZE, endpoint=True, size=3)
+    corner = low + rng.uniform(0.1, 0.9, 3) * (high - low - counts * spec.scene.spacing) * [1.0, 1.0, 0.4]
+    pos = corner + spec.scene.spacing * (integer_lattice(np.zeros(3, int), counts - 1) + 0.5)
+    walls = domain_walls(spec.scene.bounds, spec.scene.friction)  # type: ignore[attr-defined]
+    return scenes.start(spec, value, pos, rng.uniform(-LIQUID_SPEED, LIQUID_SPEED, 3), walls)
+
+
+STARTS: dict[EngineName, Start] = {"kratos": _column, "calculix": _block, "splishsplash": _liquid}
+
+
+def start(name: EngineName, candidate: Candidate, seed: int) -> State:
+    """Return the initial state of a scene. The parameter is uniform in its logarithm."""
+    rng = np.random.default_rng(seed)
+    low, _, high = candidate.values
+    return STARTS[name](candidate, float(np.exp(rng.uniform(np.log(low), np.log(high)))), rng)
+
+
+def pair(name: EngineName, candidate: Candidate, seed: int, folder: Path) -> Pair | None:
+    """Return a scene by engine and solver, or None if the engine gives up. What the engine did is kept in ``folder``, so that a stopped command goes on."""
+    scene, solver, state = SCENES[name], candidate.spec.solver, start(name, candidate, seed)
+    count = candidate.simulator.builder.config.history + round(scene.seconds / solver.frame_dt)
+    whole = rollout(solver, state, count, candidate.metadata())
+    key = sha256(b"".join(np.ascontiguousarray(x).tobytes() for x in (state.pos, state.vel, state.material_params, np.array(count))))
+    stored = folder / f"{key.hexdigest()[:16]}.npy"
+    if not stored.is_file():
+        try:
+            frames = scene.run(candidate, state, count + 1)
+        except EngineError as error:
+            log.warning("%s; the scene is left out", error)
+            frames = np.empty((0, *state.pos.shape))
+        with replacing(stored) as path, path.open("wb") as file:
+            np.save(file, frames)
+    pos = np.load(stored, allow_pickle=False)
+    if not len(pos):
+        return None
+    vel = np.concatenate([np.asarray(state.vel)[None], np.diff(pos, axis=0) / solver.frame_dt])
+    return Pair(replace(whole, pos=pos.astype(whole.pos.dtype), vel=vel.astype(whole.vel.dtype), stress=None), whole.pos)

@@ -1,0 +1,158 @@
+"""The suite of adaptation: random scenes of engines, what is trained on them, and the table."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpe_pl.benchmarks.acceptance.trial import Candidate
+from gpe_pl.benchmarks.adaptation import scenes, suite
+from gpe_pl.benchmarks.outside.engine import EngineError
+from gpe_pl.benchmarks.outside.engines import SCENES, EngineName
+from gpe_pl.benchmarks.outside.suite import candidate_of
+from gpe_pl.config.datasets import dataset
+from gpe_pl.geometry.shapes import signed_distance
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.store import iter_trajectories
+
+ENGINES: dict[EngineName, str] = {"kratos": "sand", "calculix": "fem", "splishsplash": "fluid"}
+
+
+@pytest.fixture(scope="module")
+def candidates() -> dict[EngineName, Candidate]:
+    specs = {name: dataset(f"data={name}", "size=small") for name in ENGINES.values()}
+    return {engine: candidate_of(checkpoint, specs) for engine, checkpoint in ENGINES.items()}
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_random_scenes_are_inside_the_walls_and_the_trained_range(name: EngineName, candidates: dict[EngineName, Candidate]) -> None:
+    candidate = candidates[name]
+    low, _, high = candidate.values
+    states = [scenes.start(name, candidate, seed) for seed in range(20)]
+    for state in states:
+        assert low <= float(state.material_params[0, 0]) <= high
+        assert signed_distance(state.boundary.shapes, np.asarray(state.pos)).min() > 0.2 * candidate.spacing
+    assert len({state.num_nodes for state in states}) > 5
+    np.testing.assert_array_equal(scenes.start(name, candidate, 3).pos, states[3].pos)
+
+
+def by_solver(shift: float, given_up: Sequence[int] = ()) -> Any:
+    """An engine that moves all nodes sideways at a constant speed of ``shift`` spacings per frame, and gives up some of its calls."""
+    calls = []
+
+    def run(candidate: Candidate, state: State, num_frames: int) -> np.ndarray:
+        calls.append(state)
+        if len(calls) - 1 in given_up:
+            raise EngineError("the engine: diverges")
+        return np.asarray(state.pos) + shift * candidate.spacing * np.arange(num_frames)[:, None, None] * np.eye(state.dim)[0]
+
+    return run, calls
+
+
+def with_engine(monkeypatch: pytest.MonkeyPatch, name: EngineName, run: Any) -> None:
+    monkeypatch.setitem(SCENES, name, replace(SCENES[name], run=run, is_missing=lambda: False, seconds=0.02))
+
+
+def test_a_stopped_command_does_not_run_the_engine_again(
+    tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, calls = by_solver(0.1, given_up=[1])
+    with_engine(monkeypatch, "kratos", run)
+    first = [scenes.pair("kratos", candidates["kratos"], seed, tmp_path) for seed in (0, 1)]
+    again = [scenes.pair("kratos", candidates["kratos"], seed, tmp_path) for seed in (0, 1)]
+    assert len(calls) == 2 and first[1] is None and again[1] is None
+    assert first[0] is not None and again[0] is not None
+    engine, dt = again[0].engine, candidates["kratos"].spec.solver.frame_dt
+    np.testing.assert_array_equal(engine.pos, first[0].engine.pos)
+    np.testing.assert_array_equal(engine.vel[0], 0.0)  # at rest, as the initial state says
+    np.testing.assert_allclose(engine.vel[1:, :, 0], 0.1 * candidates["kratos"].spacing / dt, rtol=1e-4)
+    assert again[0].solver.shape == engine.pos.shape and not np.array_equal(again[0].solver, engine.pos)
+
+
+def settings(**changes: Any) -> suite.Settings:
+    of_engine = {"kratos": suite.OfEngine("sand", ["model=gpe_tuned"])}
+    return suite.Settings(cases={}, engines=of_engine, **{"num_train": 2, "num_val": 1, "num_test": 2, **changes})  # type: ignore[arg-type]
+
+
+def test_what_is_trained_and_compared(tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch) -> None:
+    run, _ = by_solver(0.1, given_up=[3])
+    with_engine(monkeypatch, "kratos", run)
+    commands: list[list[str]] = []
+
+    def trained(command: list[str], **_: object) -> SimpleNamespace:
+        commands.append(command)
+        return SimpleNamespace(returncode=0)
+
+    def found(checkpoint: str, *_: object) -> dict[str, list[float]]:
+        return {"model": [1e-3, 2e-3], "ballistic": [3e-3, 4e-3]}
+
+    monkeypatch.setattr(subprocess, "run", trained)
+    monkeypatch.setattr(suite, "measured", found)
+    specs = {"sand": candidates["kratos"].spec}
+    records, table = suite.run(settings(seeds=[0, 1]), specs, tmp_path)
+    assert [(r["simulator"], r["seed"]) for r in records] == [
+        ("solver", None),
+        ("shipped model", None),
+        ("ballistic", None),
+        ("adapted", 0),
+        ("from scratch", 0),
+        ("adapted", 1),
+        ("from scratch", 1),
+    ]
+    adapted, scratch, *_ = ([part for part in command if "=" in part] for command in commands)
+    assert "start_from=sand" in adapted and "training.learning_rate=0.0003" in adapted and "name=kratos_adapted_seed_0" in adapted
+    assert not any(part.startswith("start_from") for part in scratch) and "training.learning_rate=0.001" in scratch
+    assert "training.num_steps=1500" in adapted and "training.num_steps=1500" in scratch
+    assert {
+        split: len(list(iter_trajectories(tmp_path / "data" / "kratos" / "imported", split))) for split in ("train", "val", "test")
+    } == {
+        "train": 2,
+        "val": 1,
+        "test": 2,
+    }
+    assert "Kratos MPM gave up 1 further scenes" in table
+    assert next(line for line in table.splitlines() if "| adapted |" in line).endswith("| 1 [1, 1] | 0, 1 |")
+
+
+def test_an_engine_that_gives_up_most_scenes_is_an_error(
+    tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, calls = by_solver(0.1, given_up=range(100))
+    with_engine(monkeypatch, "kratos", run)
+    with pytest.raises(suite.AdaptationError, match=r"Kratos MPM: gives up more than half of the scenes"):
+        suite.run(settings(), {"sand": candidates["kratos"].spec}, tmp_path)
+    assert len(calls) == 10
+
+
+def test_engines_that_are_missing_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SCENES, "kratos", replace(SCENES["kratos"], is_missing=lambda: True))
+    records, table = suite.run(settings(), {}, tmp_path)
+    assert records == [] and "- Kratos MPM: pip install KratosMPMApplication" in table
+
+
+def test_a_failed_training_is_named_with_its_command(
+    tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, _ = by_solver(0.1)
+    with_engine(monkeypatch, "kratos", run)
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
+    monkeypatch.setattr(suite, "measured", lambda *_: {"model": [1e-3, 2e-3]})
+    with pytest.raises(suite.AdaptationError, match=r"gpe_pl.fit data=imported data.name=kratos .* start_from=sand: failed"):
+        suite.run(settings(), {"sand": candidates["kratos"].spec}, tmp_path)
+
+
+def test_distances_are_pooled_and_compared_on_the_same_scenes() -> None:
+    rows = [("solver", None, [3.0, 4.0]), ("shipped model", None, [6.0, 8.0]), ("adapted", 0, [3.0, 4.0]), ("adapted", 1, [3.0, 4.0])]
+    records = [{"engine": "kratos", "given_up": 0, "simulator": who, "seed": seed, "rms": rms} for who, seed, rms in rows]
+    lines = suite.report(records, []).splitlines()
+    assert lines[2] == "| Kratos MPM | solver | 3.54 [3, 4] | 0.5 [0.5, 0.5] |  |"
+    assert lines[3] == "| Kratos MPM | shipped model | 7.07 [6, 8] |  |  |"
+    assert lines[4] == "| Kratos MPM | adapted | 3.54 [3, 4] | 0.5 [0.5, 0.5] | 0, 1 |"
+    assert "gave up" not in "".join(lines)
