@@ -13,7 +13,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -33,6 +33,9 @@ from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.files.markdown import table_row
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.rollouts import bootstrap_interval, bootstrap_ratio
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 
@@ -195,6 +198,27 @@ NOTE = (
     "ratio on the same scenes. Models start from some frames of the engine, the solver from its initial state. Adapted and from scratch have the same "
     "trajectories and steps."
 )
+
+
+def figures(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
+    """Draw one figure with a panel per engine: the distance of each test scene and seed as a dot, and the pooled distance as a line, by simulator."""
+    from gpe_pl.viz.film_strip import new_figure
+
+    names = [*dict.fromkeys(record["engine"] for record in records)]
+    if not names:
+        return {}
+    figure = new_figure(2.6 * len(names), 2.4)
+    figure.set_layout_engine("constrained")
+    for axes, name in zip(np.ravel(figure.subplots(1, len(names), squeeze=False)), names, strict=True):
+        tables = _tables([record for record in records if record["engine"] == name])
+        for place, (table, _) in enumerate(tables.values()):
+            axes.plot(np.full(table.size, place), table.ravel(), ".", color="0.6", markersize=3)
+            axes.plot([place - 0.3, place + 0.3], 2 * [float(pooled(table))], color="C0", linewidth=2)
+        axes.set_yscale("log")
+        axes.set_xticks(range(len(tables)), list(tables), rotation=60, ha="right", fontsize="xx-small")
+        axes.set_title(f"distance to {SCENES[name].label} [spacings]", fontsize="xx-small")
+        axes.tick_params(labelsize="xx-small")
+    return {"adaptation": figure}
 
 
 def pooled(table: np.ndarray, axis: tuple[int, int] = (-2, -1)) -> Any:

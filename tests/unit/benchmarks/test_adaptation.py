@@ -156,3 +156,7 @@ def test_distances_are_pooled_and_compared_on_the_same_scenes() -> None:
     assert lines[3] == "| Kratos MPM | shipped model | 7.07 [6, 8] |  |  |"
     assert lines[4] == "| Kratos MPM | adapted | 3.54 [3, 4] | 0.5 [0.5, 0.5] | 0, 1 |"
     assert "gave up" not in "".join(lines)
+    (axes,) = suite.figures(records)["adaptation"].axes
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["solver", "shipped model", "adapted"]
+    np.testing.assert_allclose(axes.lines[5].get_ydata(), np.sqrt(12.5))
+    assert suite.figures([]) == {}

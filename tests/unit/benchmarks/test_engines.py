@@ -85,6 +85,23 @@ def test_a_failure_has_the_last_lines_of_the_engine(tmp_path: Path, monkeypatch:
         calculix.run(falling_block(0.1, 1.0), FEM(UNIT_SQUARE, 2e-3), 4)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="the program is a shell script")
+def test_a_scene_that_the_engine_gives_up_is_tried_with_stiffer_sticking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    state = falling_block(0.1, 1.0)
+    rows = "".join(f"{node} 0.25 -0.5 0.0\n" for node in range(1, state.num_nodes + 1))
+    (tmp_path / "found.dat").write_text(f" displacements (vx,vy,vz) for set FRONT\n\n{rows}")
+    program = tmp_path / "ccx"
+    again = f"cp scene.inp {tmp_path}/2.inp; cp {tmp_path}/found.dat scene.dat"
+    program.write_text(f"#!/bin/sh\nif [ -e {tmp_path}/1.inp ]; then {again}; else cp scene.inp {tmp_path}/1.inp; fi\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    pos = calculix.run(state, FEM(UNIT_SQUARE, 2e-3), 2)
+    np.testing.assert_allclose(pos[1] - pos[0], np.tile([0.25, -0.5], (state.num_nodes, 1)))
+    first, second = ((tmp_path / name).read_text().splitlines() for name in ("1.inp", "2.inp"))
+    sticking = [float(lines[lines.index("*FRICTION") + 1].split(",")[1]) for lines in (first, second)]
+    assert sticking[1] == pytest.approx(10 * sticking[0])
+
+
 def test_points_are_big_endian_with_a_weight() -> None:
     data = splishsplash.points_file(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
     assert data[:5] == b"BgeoV" and struct.unpack(">2i", data[5:13]) == (5, 2)
