@@ -46,6 +46,7 @@ PICTURES = (
     "engines.png",
     "bands.png",
     "active.png",
+    "adaptation.png",
     "channel.png",
     *("acceptance_fem_beam.png", "acceptance_elastomer_square.png", "acceptance_sand_column.png"),
     "scenes/*_00000_misfit.png",

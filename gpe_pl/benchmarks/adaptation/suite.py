@@ -202,6 +202,8 @@ NOTE = (
 
 def figures(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
     """Draw one figure with a panel per engine: the distance of each test scene and seed as a dot, and the pooled distance as a line, by simulator."""
+    from matplotlib.ticker import LogLocator
+
     from gpe_pl.viz.film_strip import new_figure
 
     names = [*dict.fromkeys(record["engine"] for record in records)]
@@ -217,7 +219,10 @@ def figures(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
         axes.set_yscale("log")
         axes.set_xticks(range(len(tables)), list(tables), rotation=60, ha="right", fontsize="xx-small")
         axes.set_title(f"distance to {SCENES[name].label} [spacings]", fontsize="xx-small")
-        axes.tick_params(labelsize="xx-small")
+        axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
+        axes.tick_params(which="both", labelsize="xx-small")
     return {"adaptation": figure}
 
 
