@@ -9,7 +9,6 @@ Values of the material parameter lie in the range that the model was trained on.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -19,7 +18,6 @@ import numpy as np
 
 from gpe_pl.benchmarks.acceptance import scenes
 from gpe_pl.benchmarks.acceptance.trial import Candidate
-from gpe_pl.benchmarks.outside.engine import EngineError
 from gpe_pl.benchmarks.outside.engines import SCENES, EngineName
 from gpe_pl.files.atomic import replacing
 from gpe_pl.geometry.shapes import domain_walls
@@ -28,8 +26,6 @@ from gpe_pl.schema import STICKY
 from gpe_pl.solvers.scenes import JITTER, integer_lattice
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
-
-log = logging.getLogger(__name__)
 
 COLUMN_WIDTH, COLUMN_HEIGHT = (8, 20), (10, 28)
 """Smallest and largest number of particles of a column of sand along each axis."""
@@ -92,23 +88,25 @@ def start(name: EngineName, candidate: Candidate, seed: int) -> State:
     return STARTS[name](candidate, float(np.exp(rng.uniform(np.log(low), np.log(high)))), rng)
 
 
-def pair(name: EngineName, candidate: Candidate, seed: int, folder: Path) -> Pair | None:
-    """Return a scene by engine and solver, or None if the engine gives up. What the engine did is kept in ``folder``, so that a stopped command goes on."""
+def pair(name: EngineName, candidate: Candidate, seed: int, folder: Path) -> Pair:
+    """Return a scene by engine and solver. What the engine did is kept in ``folder``, so that a stopped command goes on.
+
+    Raises:
+        EngineError: the engine failed.
+    """
     scene, solver, state = SCENES[name], candidate.spec.solver, start(name, candidate, seed)
     count = candidate.simulator.builder.config.history + round(scene.seconds / solver.frame_dt)
-    whole = rollout(solver, state, count, candidate.metadata())
-    key = sha256(b"".join(np.ascontiguousarray(x).tobytes() for x in (state.pos, state.vel, state.material_params, np.array(count))))
-    stored = folder / f"{key.hexdigest()[:16]}.npy"
+    stored = folder / f"{digest_of(state.pos, state.vel, state.material_params, np.array(count))}.npy"
     if not stored.is_file():
-        try:
-            frames = scene.run(candidate, state, count + 1)
-        except EngineError as error:
-            log.warning("%s; the scene is left out", error)
-            frames = np.empty((0, *state.pos.shape))
+        frames = scene.run(candidate, state, count + 1)
         with replacing(stored) as path, path.open("wb") as file:
             np.save(file, frames)
     pos = np.load(stored, allow_pickle=False)
-    if not len(pos):
-        return None
+    whole = rollout(solver, state, count, candidate.metadata())
     vel = np.concatenate([np.asarray(state.vel)[None], np.diff(pos, axis=0) / solver.frame_dt])
     return Pair(replace(whole, pos=pos.astype(whole.pos.dtype), vel=vel.astype(whole.vel.dtype), stress=None), whole.pos)
+
+
+def digest_of(*arrays: np.ndarray) -> str:
+    """Return a short digest of the bytes of arrays."""
+    return sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:16]

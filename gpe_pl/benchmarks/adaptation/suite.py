@@ -20,8 +20,9 @@ import torch
 from pydantic import Field
 
 from gpe_pl.benchmarks.acceptance.trial import Candidate
-from gpe_pl.benchmarks.adaptation.scenes import Pair, pair
+from gpe_pl.benchmarks.adaptation.scenes import Pair, digest_of, pair
 from gpe_pl.benchmarks.learning_sets.measures import MODEL, lasting, rms_distance
+from gpe_pl.benchmarks.outside.engine import EngineError
 from gpe_pl.benchmarks.outside.engines import SCENES, EngineName
 from gpe_pl.benchmarks.outside.suite import candidate_of
 from gpe_pl.benchmarks.trained import Case
@@ -109,17 +110,18 @@ def run(settings: Settings, specs: Mapping[str, DatasetSpec], folder: Path) -> t
 
 
 def _of_engine(name: EngineName, own: OfEngine, candidate: Candidate, settings: Settings, folder: Path) -> list[dict[str, Any]]:
-    tests, num_given_up = _made(name, candidate, settings, folder)
+    pairs, num_given_up = _made(name, candidate, settings, folder)
+    dataset, tests = _stored(name, pairs, settings, folder), pairs[-settings.num_test :]
     start = candidate.simulator.builder.config.history
     rows: list[tuple[str, int | None, list[float]]] = [
         (SOLVER, None, [rms_distance(p.solver[start + 1 :], p.engine.pos[start + 1 :]) for p in tests])
     ]
-    root = folder / "data" / name / FOLDER
+    root = folder / "data" / dataset / FOLDER
     for who, values in measured(own.checkpoint, root, start).items():
         rows.append((SHIPPED if who == MODEL else who.replace("_", " "), None, values))
     for seed in settings.seeds:
         for who in (ADAPTED, SCRATCH):
-            checkpoint = _trained(name, own, who, seed, settings, folder)
+            checkpoint = _trained(dataset, own, who, seed, settings, folder)
             rows.append((who, seed, measured(str(checkpoint), root, start)[MODEL]))
     about = {"engine": name, "given_up": num_given_up}
     return [
@@ -128,26 +130,37 @@ def _of_engine(name: EngineName, own: OfEngine, candidate: Candidate, settings: 
 
 
 def _made(name: EngineName, candidate: Candidate, settings: Settings, folder: Path) -> tuple[list[Pair], int]:
-    """Make the scenes and the data set, as far as they are missing. Return the test scenes, and the number of scenes that the engine gave up."""
+    """Make the scenes, as far as they are missing. Return them, and the number of scenes that the engine gave up."""
     kept = folder / "scenes" / name
     kept.mkdir(parents=True, exist_ok=True)
     total = settings.num_train + settings.num_val + settings.num_test
-    pairs, seed = list[Pair](), 0
-    while len(pairs) < total:
-        if seed == MOST * total:
-            raise AdaptationError(f"{SCENES[name].label}: gives up more than half of the scenes; {kept} has those that it finished")
-        log.info("%s: scene %d of %d", SCENES[name].label, len(pairs) + 1, total)
-        found = pair(name, candidate, seed, kept)
-        pairs += [] if found is None else [found]
-        seed += 1
-    test = pairs[total - settings.num_test :]
-    if not (folder / "data" / name / FOLDER).is_dir():
-        trajectories = [p.engine for p in pairs]
-        train, val = trajectories[: settings.num_train], trajectories[settings.num_train : total - settings.num_test]
-        report = save_dataset(folder / "data", name, train=train, val=val, test=[p.engine for p in test])
+    pairs, label = list[Pair](), SCENES[name].label
+    for seed in range(MOST * total):
+        log.info("%s: scene %d of %d", label, len(pairs) + 1, total)
+        try:
+            pairs.append(pair(name, candidate, seed, kept))
+        except EngineError as error:
+            log.warning("%s; the scene is left out", error)
+            last = error
+        if len(pairs) == total:
+            return pairs, seed + 1 - total
+    raise AdaptationError(f"{label}: gives up more than half of the scenes. {last}; {kept} has those that it finished") from last
+
+
+def _stored(name: EngineName, pairs: Sequence[Pair], settings: Settings, folder: Path) -> str:
+    """Write the engine's scenes as a data set, unless an earlier run has done so, and return its name, which other scenes or splits do not share."""
+    trajectories, num_held_out = [p.engine for p in pairs], settings.num_val + settings.num_test
+    dataset = f"{name}_{digest_of(np.array([settings.num_train, settings.num_val]), *(t.pos for t in trajectories))}"
+    if not (folder / "data" / dataset / FOLDER).is_dir():
+        train, val, test = (
+            trajectories[:-num_held_out],
+            trajectories[-num_held_out : -settings.num_test],
+            trajectories[-settings.num_test :],
+        )
+        report = save_dataset(folder / "data", dataset, train=train, val=val, test=test)
         if report.refusals:
             raise AdaptationError(f"{SCENES[name].label}: {len(report.refusals)} scenes cannot be used: {report.refusals[0]}")
-    return test, seed - total
+    return dataset
 
 
 def measured(checkpoint: str, root: Path, start: int) -> dict[str, list[float]]:
@@ -161,11 +174,11 @@ def measured(checkpoint: str, root: Path, start: int) -> dict[str, list[float]]:
     return found
 
 
-def _trained(name: EngineName, own: OfEngine, who: str, seed: int, settings: Settings, folder: Path) -> Path:
+def _trained(dataset: str, own: OfEngine, who: str, seed: int, settings: Settings, folder: Path) -> Path:
     """Train with one seed, unless it has been done, and return the checkpoint."""
-    run_name = f"{name}_{who.replace(' ', '_')}_seed_{seed}"
+    run_name = f"{dataset}_{who.replace(' ', '_')}_seed_{seed}"
     rate = settings.learning_rate if who == SCRATCH else settings.adapted_learning_rate
-    overrides = ["data=imported", f"data.name={name}", f"name={run_name}", f"seed={seed}", *own.training]
+    overrides = ["data=imported", f"data.name={dataset}", f"name={run_name}", f"seed={seed}", *own.training]
     overrides += [f"training.num_steps={settings.num_steps}", f"training.learning_rate={rate:g}"]
     overrides += [f"start_from={own.checkpoint}"] if who == ADAPTED else []
     paths = [f"paths.data={folder / 'data'}", f"paths.runs={folder / 'runs'}"]
@@ -196,7 +209,7 @@ def report(records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, st
 NOTE = (
     "Whole rollouts on the engine's test scenes: RMS distance over frames, nodes and scenes, with its 95 % bootstrap interval over scenes and seeds, and the "
     "ratio on the same scenes. Models start from some frames of the engine, the solver from its initial state. Adapted and from scratch have the same "
-    "trajectories and steps."
+    "trajectories and steps, and learning rates of their own."
 )
 
 

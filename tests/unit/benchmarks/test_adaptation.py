@@ -43,7 +43,7 @@ def test_random_scenes_are_inside_the_walls_and_the_trained_range(name: EngineNa
     np.testing.assert_array_equal(scenes.start(name, candidate, 3).pos, states[3].pos)
 
 
-def by_solver(shift: float, given_up: Sequence[int] = ()) -> Any:
+def engine_that_slides(shift: float, given_up: Sequence[int] = ()) -> Any:
     """An engine that moves all nodes sideways at a constant speed of ``shift`` spacings per frame, and gives up some of its calls."""
     calls = []
 
@@ -63,17 +63,15 @@ def with_engine(monkeypatch: pytest.MonkeyPatch, name: EngineName, run: Any) -> 
 def test_a_stopped_command_does_not_run_the_engine_again(
     tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, calls = by_solver(0.1, given_up=[1])
+    run, calls = engine_that_slides(0.1)
     with_engine(monkeypatch, "kratos", run)
-    first = [scenes.pair("kratos", candidates["kratos"], seed, tmp_path) for seed in (0, 1)]
-    again = [scenes.pair("kratos", candidates["kratos"], seed, tmp_path) for seed in (0, 1)]
-    assert len(calls) == 2 and first[1] is None and again[1] is None
-    assert first[0] is not None and again[0] is not None
-    engine, dt = again[0].engine, candidates["kratos"].spec.solver.frame_dt
-    np.testing.assert_array_equal(engine.pos, first[0].engine.pos)
+    first, again = (scenes.pair("kratos", candidates["kratos"], 0, tmp_path) for _ in range(2))
+    assert len(calls) == 1
+    engine, dt = again.engine, candidates["kratos"].spec.solver.frame_dt
+    np.testing.assert_array_equal(engine.pos, first.engine.pos)
     np.testing.assert_array_equal(engine.vel[0], 0.0)  # at rest, as the initial state says
     np.testing.assert_allclose(engine.vel[1:, :, 0], 0.1 * candidates["kratos"].spacing / dt, rtol=1e-4)
-    assert again[0].solver.shape == engine.pos.shape and not np.array_equal(again[0].solver, engine.pos)
+    assert again.solver.shape == engine.pos.shape and not np.array_equal(again.solver, engine.pos)
 
 
 def settings(**changes: Any) -> suite.Settings:
@@ -82,7 +80,7 @@ def settings(**changes: Any) -> suite.Settings:
 
 
 def test_what_is_trained_and_compared(tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch) -> None:
-    run, _ = by_solver(0.1, given_up=[3])
+    run, _ = engine_that_slides(0.1, given_up=[3])
     with_engine(monkeypatch, "kratos", run)
     commands: list[list[str]] = []
 
@@ -106,12 +104,13 @@ def test_what_is_trained_and_compared(tmp_path: Path, candidates: dict[EngineNam
         ("adapted", 1),
         ("from scratch", 1),
     ]
+    (dataset_name,) = (path.name for path in (tmp_path / "data").iterdir())
     adapted, scratch, *_ = ([part for part in command if "=" in part] for command in commands)
-    assert "start_from=sand" in adapted and "training.learning_rate=0.0003" in adapted and "name=kratos_adapted_seed_0" in adapted
+    assert "start_from=sand" in adapted and "training.learning_rate=0.0003" in adapted and f"name={dataset_name}_adapted_seed_0" in adapted
     assert not any(part.startswith("start_from") for part in scratch) and "training.learning_rate=0.001" in scratch
     assert "training.num_steps=1500" in adapted and "training.num_steps=1500" in scratch
     assert {
-        split: len(list(iter_trajectories(tmp_path / "data" / "kratos" / "imported", split))) for split in ("train", "val", "test")
+        split: len(list(iter_trajectories(tmp_path / "data" / dataset_name / "imported", split))) for split in ("train", "val", "test")
     } == {
         "train": 2,
         "val": 1,
@@ -119,14 +118,16 @@ def test_what_is_trained_and_compared(tmp_path: Path, candidates: dict[EngineNam
     }
     assert "Kratos MPM gave up 1 further scenes" in table
     assert next(line for line in table.splitlines() if "| adapted |" in line).endswith("| 1 [1, 1] | 0, 1 |")
+    suite.run(settings(num_train=1), specs, tmp_path)  # other splits of the same scenes are another data set
+    assert len(list((tmp_path / "data").iterdir())) == 2
 
 
 def test_an_engine_that_gives_up_most_scenes_is_an_error(
     tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, calls = by_solver(0.1, given_up=range(100))
+    run, calls = engine_that_slides(0.1, given_up=range(100))
     with_engine(monkeypatch, "kratos", run)
-    with pytest.raises(suite.AdaptationError, match=r"Kratos MPM: gives up more than half of the scenes"):
+    with pytest.raises(suite.AdaptationError, match=r"Kratos MPM: gives up more than half of the scenes. the engine: diverges"):
         suite.run(settings(), {"sand": candidates["kratos"].spec}, tmp_path)
     assert len(calls) == 10
 
@@ -140,11 +141,11 @@ def test_engines_that_are_missing_are_named(tmp_path: Path, monkeypatch: pytest.
 def test_a_failed_training_is_named_with_its_command(
     tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, _ = by_solver(0.1)
+    run, _ = engine_that_slides(0.1)
     with_engine(monkeypatch, "kratos", run)
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
     monkeypatch.setattr(suite, "measured", lambda *_: {"model": [1e-3, 2e-3]})
-    with pytest.raises(suite.AdaptationError, match=r"gpe_pl.fit data=imported data.name=kratos .* start_from=sand: failed"):
+    with pytest.raises(suite.AdaptationError, match=r"gpe_pl.fit data=imported data.name=kratos_[0-9a-f]{16} .* start_from=sand: failed"):
         suite.run(settings(), {"sand": candidates["kratos"].spec}, tmp_path)
 
 
