@@ -18,13 +18,14 @@ import numpy as np
 
 from gpe_pl.benchmarks.acceptance import scenes
 from gpe_pl.benchmarks.acceptance.trial import Candidate
+from gpe_pl.benchmarks.outside.engine import Motion
 from gpe_pl.benchmarks.outside.engines import SCENES, EngineName
 from gpe_pl.files.atomic import replacing
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import STICKY
 from gpe_pl.solvers.scenes import JITTER, integer_lattice
-from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Trajectory
 
 COLUMN_WIDTH, COLUMN_HEIGHT = (8, 20), (10, 28)
@@ -44,7 +45,7 @@ class Pair:
     """The same scene by an engine and by the solver.
 
     Attributes:
-        engine: trajectory of the engine, with the mean velocity over the last frame.
+        engine: trajectory of the engine, with the mean velocity over the last frame, and with the stress if the engine has one.
         solver: positions of the solver [frame, node, dim] in m.
     """
 
@@ -96,15 +97,25 @@ def pair(name: EngineName, candidate: Candidate, seed: int, folder: Path) -> Pai
     """
     scene, solver, state = SCENES[name], candidate.spec.solver, start(name, candidate, seed)
     count = candidate.simulator.builder.config.history + round(scene.seconds / solver.frame_dt)
-    stored = folder / f"{digest_of(state.pos, state.vel, state.material_params, np.array(count))}.npy"
-    if not stored.is_file():
-        frames = scene.run(candidate, state, count + 1)
-        with replacing(stored) as path, path.open("wb") as file:
-            np.save(file, frames)
-    pos = np.load(stored, allow_pickle=False)
+    motion = _kept(
+        folder / f"{digest_of(state.pos, state.vel, state.material_params, np.array(count))}.npz",
+        lambda: scene.run(candidate, state, count + 1),
+    )
     whole = rollout(solver, state, count, candidate.metadata())
-    vel = np.concatenate([np.asarray(state.vel)[None], np.diff(pos, axis=0) / solver.frame_dt])
-    return Pair(replace(whole, pos=pos.astype(whole.pos.dtype), vel=vel.astype(whole.vel.dtype), stress=None), whole.pos)
+    vel = np.concatenate([np.asarray(state.vel)[None], np.diff(motion.pos, axis=0) / solver.frame_dt])
+    stress = None if motion.stress is None else Stress(*(a.astype(np.float32) for a in (motion.stress.node, motion.stress.cell)))
+    return Pair(replace(whole, pos=motion.pos.astype(whole.pos.dtype), vel=vel.astype(whole.vel.dtype), stress=stress), whole.pos)
+
+
+def _kept(path: Path, run: Callable[[], Motion]) -> Motion:
+    """Return the motion in a file. If there is none, run the engine and write it."""
+    if not path.is_file():
+        motion = run()
+        stress = {} if motion.stress is None else {"node_stress": motion.stress.node, "cell_stress": motion.stress.cell}
+        with replacing(path) as new, new.open("wb") as file:
+            np.savez(file, pos=motion.pos, **stress)
+    with np.load(path, allow_pickle=False) as arrays:
+        return Motion(arrays["pos"], Stress(arrays["node_stress"], arrays["cell_stress"]) if "cell_stress" in arrays else None)
 
 
 def digest_of(*arrays: np.ndarray) -> str:

@@ -4,23 +4,25 @@ Each triangle becomes a wedge of one spacing in depth, whose nodes do not move a
 
     Ψ = μ/2 (J^(-2/3) tr C - 3) + κ/2 (J - 1)²,   κ = λ + 2μ/3
 
-It equals the law of ``solvers.fem`` for small strains. Masses are consistent, not lumped, and damping is proportional to the stiffness as in ``solvers.fem``.
-Only the floor takes part in contact: a scene must keep the body away from the other walls.
+It equals the law of ``solvers.fem`` for small strains. Masses are consistent, not lumped, and damping is proportional to the stiffness (see
+``stiffness_damping``). The stress is elastic; nodes have the mean over their cells. Only the floor takes part in contact: a scene must keep the body away from
+the other walls.
 """
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from gpe_pl.benchmarks.outside.engine import EngineError, last_lines, output_of
+from gpe_pl.benchmarks.outside.engine import EngineError, Motion, last_lines, output_of
 from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.fem.elements import build_mesh
 from gpe_pl.solvers.materials import lame_parameters
-from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.state import State, Stress
 
 PROGRAM = "ccx"
 ATTEMPTS = ((20, 0.1), (20, 1.0), (60, 1.0))
@@ -37,36 +39,72 @@ def is_missing() -> bool:
     return shutil.which(PROGRAM) is None
 
 
-def run(state: State, solver: FEM, num_frames: int) -> np.ndarray:
-    """Return positions [frame, node, 2] in m; the first frame is ``state``.
+def run(state: State, solver: FEM, num_frames: int) -> Motion:
+    """Return positions and stress of a scene.
 
     Args:
-        state: one body of triangles above the floor of a box, whose friction is that of the floor.
+        state: one body of triangles above the floor of a box, whose friction is that of the floor. Its cells have no stress.
         solver: solver whose Poisson's ratio, damping and frames are used.
         num_frames: number of frames, the first one included.
 
     Raises:
         EngineError: the engine failed or stopped early; the message has its last lines.
     """
+    pos, cells = np.asarray(state.pos), np.asarray(state.cells)
     for increments, sticking in ATTEMPTS:
         with tempfile.TemporaryDirectory() as folder:
             Path(folder, "scene.inp").write_text(deck(state, solver, num_frames, increments, sticking), encoding="ascii")
             said = output_of("CalculiX", [PROGRAM, "-i", "scene"], Path(folder), SECONDS)
             table = Path(folder, "scene.dat")
-            frames = (
-                displacements(table.read_text(encoding="ascii"), state.num_nodes) if table.is_file() else np.empty((0, state.num_nodes, 2))
-            )
-        if len(frames) == num_frames - 1:
-            return np.concatenate([state.pos[None], state.pos + frames])
-    raise EngineError(f"CalculiX: has {len(frames)} of {num_frames - 1} frames; its last lines are: {last_lines(said)}")
+            text = table.read_text(encoding="ascii") if table.is_file() else ""
+        moved, stress = displacements(text, len(pos)), cell_stresses(text, len(cells))
+        if len(moved) == len(stress) == num_frames - 1:
+            at_cells = np.concatenate([np.zeros_like(stress[:1]), stress])
+            averaging = build_mesh(pos, cells, np.asarray(state.mass)).averaging
+            return Motion(np.concatenate([pos[None], pos + moved]), Stress(np.stack([averaging @ frame for frame in at_cells]), at_cells))
+    raise EngineError(f"CalculiX: has {len(moved)} of {num_frames - 1} frames; its last lines are: {last_lines(said)}")
+
+
+def stiffness_damping(viscosity: float, modulus: float, poisson_ratio: float) -> float:
+    """Return the damping per stiffness [s] with which a bar in plane strain, free at its sides, stretches as with the viscous stress ``2η Ė``.
+
+    The two kinds of damping cannot agree in all modes. A body that bounces or bends mostly stretches so; per elastic energy, ``2η Ė`` damps its shear 1.2 times
+    and its volume 0.4 times as much, for a Poisson's ratio of 0.35.
+
+    Args:
+        viscosity: η in Pa s.
+        modulus: Young's modulus [Pa].
+        poisson_ratio: Poisson's ratio.
+    """
+    across = poisson_ratio / (1 - poisson_ratio)
+    return 2 * viscosity * (1 + across**2) * (1 - poisson_ratio**2) / modulus
 
 
 def displacements(text: str, num_nodes: int) -> np.ndarray:
-    """Return displacements [frame, node, 2] from a ``.dat`` file, which has a heading and a line per node and frame."""
-    rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("displacements")]
-    whole = len(rows) // num_nodes
-    values = np.array([[float(x) for x in row] for row in rows[: whole * num_nodes]]).reshape(whole, num_nodes, 4)
-    return values[:, :, 1:3]
+    """Return displacements [frame, node, 2] in m of the frames that a ``.dat`` file has in full."""
+    return _table(text, "displacements", num_nodes, 4)[:, :, 1:3]
+
+
+def cell_stresses(text: str, num_cells: int) -> np.ndarray:
+    """Return Cauchy stresses [frame, cell, 4] in Pa of the frames that a ``.dat`` file has in full, in the order of ``State.stress``.
+
+    A wedge has two integration points, one above the other; its stress is their mean.
+    """
+    points = _table(text, "stresses", 2 * num_cells, 8)[:, :, 2:]  # xx, yy, zz, xy, xz, yz
+    cells = points.reshape(len(points), num_cells, 2, 6).mean(axis=2)
+    return np.asarray(cells[..., [0, 3, 1, 2]])
+
+
+def _table(text: str, quantity: str, num_rows: int, num_columns: int) -> np.ndarray:
+    """Return the numbers [frame, row, column] of the frames of a quantity that a ``.dat`` file has in full. Each frame has a heading with the quantity's name."""
+    rows, is_wanted = list[list[float]](), False
+    for words in map(str.split, text.splitlines()):
+        if words and words[0][0].isalpha():
+            is_wanted = words[0] == quantity
+        elif words and is_wanted:
+            rows.append([float(word) for word in words])
+    whole = len(rows) // num_rows
+    return np.array(rows[: whole * num_rows]).reshape(whole, num_rows, num_columns)
 
 
 def deck(state: State, solver: FEM, num_frames: int, increments: int, sticking: float) -> str:
@@ -79,9 +117,7 @@ def deck(state: State, solver: FEM, num_frames: int, increments: int, sticking: 
     depth = float(np.sqrt(2 * area / len(cells)))
     modulus = float(state.material_params[0, 0])
     lam, mu = (float(value) for value in lame_parameters(modulus, solver.poisson_ratio))
-    damping = (
-        2 * solver.damping / float(np.sqrt(mesh.scale * (2 * mu + 2 * lam)))
-    )  # the fastest mode has the same fraction of the critical damping
+    damping = stiffness_damping(solver.damping * math.sqrt((2 * mu + 2 * lam) / mesh.scale), modulus, solver.poisson_ratio)
     low = solver.bounds[1][0]
     left, right = solver.bounds[0]
     friction = next(shape.friction for shape in state.boundary.shapes if abs(getattr(shape, "normal", (0, 0))[1] - 1) < 1e-9)
@@ -129,5 +165,6 @@ def deck(state: State, solver: FEM, num_frames: int, increments: int, sticking: 
         f"{step:.9e}, {(num_frames - 1) * solver.frame_dt:.9e}",
     ]
     lines += ["*DLOAD", f"BODY, GRAV, {gravity:.9e}, {direction[0]:.9e}, {direction[1]:.9e}, 0."]
-    lines += [f"*NODE PRINT, NSET=FRONT, FREQUENCY={increments}", "U", "*END STEP", ""]
+    lines += [f"*NODE PRINT, NSET=FRONT, FREQUENCY={increments}", "U"]
+    lines += [f"*EL PRINT, ELSET=BODY, FREQUENCY={increments}", "S", "*END STEP", ""]
     return "\n".join(lines)

@@ -1,19 +1,34 @@
-"""What the modules of other engines share: how their programs run, and the error if one fails."""
+"""What the modules of other engines share: what they return, how their programs run, and the error if one fails."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from gpe_pl.errors import GpeError
+from gpe_pl.trajectory.state import Stress
 
 
 class EngineError(GpeError, RuntimeError):
     """Raised when another engine fails; the message has its last lines."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What an engine did with a scene.
+
+    Attributes:
+        pos: positions [frame, node, dim] in m; the first frame is the initial state.
+        stress: Cauchy stress in Pa with a leading axis of frames; None if the engine has none at nodes of a mesh.
+    """
+
+    pos: np.ndarray
+    stress: Stress | None = None
 
 
 def last_lines(text: str, count: int = 4) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 from gpe_pl.benchmarks.acceptance import scenes
 from gpe_pl.benchmarks.acceptance.trial import Candidate, predicted
 from gpe_pl.benchmarks.outside import calculix, kratos, splishsplash
+from gpe_pl.benchmarks.outside.engine import Motion
 from gpe_pl.benchmarks.outside.experiments import DAM_WIDTH, FRONT, HALF_WIDTH, filled
 from gpe_pl.files.markdown import table_row
 from gpe_pl.rollout.loop import rollout
@@ -72,7 +73,7 @@ class EngineScene:
         material: material of the scene.
         about: the scene in words.
         start: initial state for a model, by its material parameter.
-        run: positions [frame, node, dim] in m by the engine, from the initial state and the number of frames.
+        run: what the engine does, from the initial state and the number of frames.
         seconds: duration of the scene [s].
         quantities: what is compared.
         points: whether the nodes are the same material points over the whole scene, so that their distance is compared too.
@@ -85,7 +86,7 @@ class EngineScene:
     material: str
     about: str
     start: Callable[[Candidate, float], State]
-    run: Callable[[Candidate, State, int], np.ndarray]
+    run: Callable[[Candidate, State, int], Motion]
     seconds: float
     quantities: Quantities
     points: bool
@@ -96,7 +97,7 @@ def _block(candidate: Candidate, value: float) -> State:
     return scenes.dropped_block(candidate.spec, value, 10, 8, DROP_GAP, DROP_SPEED)
 
 
-def _by_calculix(candidate: Candidate, state: State, num_frames: int) -> np.ndarray:
+def _by_calculix(candidate: Candidate, state: State, num_frames: int) -> Motion:
     solver: Any = candidate.spec.solver
     return calculix.run(state, solver, num_frames)
 
@@ -109,19 +110,19 @@ def _dam(candidate: Candidate, value: float) -> State:
     return filled(spec, value, low, np.round(size / spec.scene.spacing).astype(int), jitter=0.0)
 
 
-def _by_splishsplash(candidate: Candidate, state: State, num_frames: int) -> np.ndarray:
+def _by_splishsplash(candidate: Candidate, state: State, num_frames: int) -> Motion:
     scene = candidate.spec.scene
-    return splishsplash.run(state, scene.bounds, scene.spacing, candidate.spec.solver.frame_dt, num_frames)
+    return Motion(splishsplash.run(state, scene.bounds, scene.spacing, candidate.spec.solver.frame_dt, num_frames))
 
 
 def _column(candidate: Candidate, value: float) -> State:
     return scenes.column(candidate.spec, value, 2 * HALF_WIDTH, COLUMN_ASPECT * HALF_WIDTH)
 
 
-def _by_kratos(candidate: Candidate, state: State, num_frames: int) -> np.ndarray:
+def _by_kratos(candidate: Candidate, state: State, num_frames: int) -> Motion:
     scene, solver = candidate.spec.scene, candidate.spec.solver
     constants: Any = solver
-    return kratos.run(state, constants.constants_of("sand"), scene.bounds, scene.spacing, solver.frame_dt, num_frames)
+    return Motion(kratos.run(state, constants.constants_of("sand"), scene.bounds, scene.spacing, solver.frame_dt, num_frames))
 
 
 SCENES: dict[str, EngineScene] = {
@@ -167,7 +168,7 @@ def compared(name: str, candidate: Candidate) -> list[dict[str, Any]]:
         count = history + max(2, round(scene.seconds / solver.frame_dt))
         whole = rollout(solver, start, count, candidate.metadata())
         model, _ = predicted(candidate, candidate.simulator.initial_state(whole, history), whole.frames(history))
-        by = {"engine": scene.run(candidate, start, count + 1)[history:], "solver": whole.pos[history:], "model": model.pos}
+        by = {"engine": scene.run(candidate, start, count + 1).pos[history:], "solver": whole.pos[history:], "model": model.pos}
         every = max(1, len(by["solver"]) // POINTS)
         times = solver.frame_dt * (history + np.arange(len(by["solver"])))[::every]
         about = {"engine_name": name, "model": candidate.name, "parameter": candidate.described(value), "spacing": candidate.spacing}
