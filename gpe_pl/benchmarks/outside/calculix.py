@@ -96,7 +96,7 @@ def cell_stresses(text: str, num_cells: int) -> np.ndarray:
 
 
 def _table(text: str, quantity: str, num_rows: int, num_columns: int) -> np.ndarray:
-    """Return the numbers [frame, row, column] of the frames of a quantity that a ``.dat`` file has in full. Each frame has a heading with the quantity's name."""
+    """Return the numbers [frame, row, column] of a quantity in the frames that a ``.dat`` file has in full. Headings begin with the name of the quantity."""
     rows, is_wanted = list[list[float]](), False
     for words in map(str.split, text.splitlines()):
         if words and words[0][0].isalpha():

@@ -14,12 +14,12 @@ import pytest
 
 from gpe_pl.benchmarks.acceptance.trial import Candidate
 from gpe_pl.benchmarks.adaptation import scenes, suite
-from gpe_pl.benchmarks.outside.engine import EngineError
+from gpe_pl.benchmarks.outside.engine import EngineError, Motion
 from gpe_pl.benchmarks.outside.engines import SCENES, EngineName
 from gpe_pl.benchmarks.outside.suite import candidate_of
 from gpe_pl.config.datasets import dataset
 from gpe_pl.geometry.shapes import signed_distance
-from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.store import iter_trajectories
 
 ENGINES: dict[EngineName, str] = {"kratos": "sand", "calculix": "fem", "splishsplash": "fluid"}
@@ -47,11 +47,14 @@ def engine_that_slides(shift: float, given_up: Sequence[int] = ()) -> Any:
     """An engine that moves all nodes sideways at a constant speed of ``shift`` spacings per frame, and gives up some of its calls."""
     calls = []
 
-    def run(candidate: Candidate, state: State, num_frames: int) -> np.ndarray:
+    def run(candidate: Candidate, state: State, num_frames: int) -> Motion:
         calls.append(state)
         if len(calls) - 1 in given_up:
             raise EngineError("the engine: diverges")
-        return np.asarray(state.pos) + shift * candidate.spacing * np.arange(num_frames)[:, None, None] * np.eye(state.dim)[0]
+        pos = np.asarray(state.pos) + shift * candidate.spacing * np.arange(num_frames)[:, None, None] * np.eye(state.dim)[0]
+        if state.cells is None:
+            return Motion(pos)
+        return Motion(pos, Stress(*(np.full((num_frames, count, 4), 1e5) for count in (len(pos[0]), len(state.cells)))))
 
     return run, calls
 
@@ -72,6 +75,23 @@ def test_a_stopped_command_does_not_run_the_engine_again(
     np.testing.assert_array_equal(engine.vel[0], 0.0)  # at rest, as the initial state says
     np.testing.assert_allclose(engine.vel[1:, :, 0], 0.1 * candidates["kratos"].spacing / dt, rtol=1e-4)
     assert again.solver.shape == engine.pos.shape and not np.array_equal(again.solver, engine.pos)
+
+
+def test_the_stress_of_an_engine_is_stored_with_its_scenes(
+    tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, _ = engine_that_slides(0.1)
+    with_engine(monkeypatch, "calculix", run)
+    pairs = [
+        scenes.pair("calculix", candidates["calculix"], seed, tmp_path) for seed in (0, 1, 2, 3, 0)
+    ]  # the last one is read from the file
+    assert pairs[-1].engine.stress is not None
+    of_engine = {"calculix": suite.OfEngine("fem", [])}
+    name = suite._stored("calculix", pairs[1:], suite.Settings({}, of_engine, 1, 1, 2), tmp_path)  # type: ignore[arg-type]
+    for split in ("train", "val", "test"):
+        for trajectory in iter_trajectories(tmp_path / "data" / name / "imported", split):
+            assert trajectory.metadata.with_stress == ("solid",) and trajectory.stress is not None
+            assert (trajectory.stress.cell == 1e5).all() and (trajectory.stress.node == 1e5).all()
 
 
 def settings(**changes: Any) -> suite.Settings:

@@ -17,12 +17,13 @@ import pytest
 from gpe_pl.benchmarks.acceptance.scenes import block
 from gpe_pl.benchmarks.acceptance.trial import Candidate
 from gpe_pl.benchmarks.outside import calculix, engines, kratos, splishsplash
-from gpe_pl.benchmarks.outside.engine import EngineError
+from gpe_pl.benchmarks.outside.engine import EngineError, Motion
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.fem import FEM
-from gpe_pl.solvers.materials import Sand
+from gpe_pl.solvers.fem.elements import build_mesh, cauchy_stress
+from gpe_pl.solvers.materials import Sand, lame_parameters
 from gpe_pl.solvers.solid_scenes import lumped_masses
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
@@ -64,6 +65,17 @@ def test_displacements_are_read_by_frame_and_node() -> None:
     np.testing.assert_allclose(frames, [[[0.1, 0.2], [0.3, 0.4]], [[0.5, 0.2], [0.3, 0.4]]])
 
 
+def test_the_stress_of_a_cell_is_the_mean_of_its_two_points_in_the_order_of_states() -> None:
+    heading = "\n stresses (elem, integ.pnt.,sxx,syy,szz,sxy,sxz,syz) for set BODY and time  0.1E-02\n\n"
+    points = " 1 1 1.0 2.0 3.0 4.0 0.0 0.0\n 1 2 3.0 2.0 3.0 4.0 0.0 0.0\n 2 1 5.0 6.0 7.0 8.0 0.0 0.0\n 2 2 5.0 6.0 7.0 8.0 0.0 0.0\n"
+    moved = "\n displacements (vx,vy,vz) for set FRONT and time  0.1E-02\n\n 1 1.0E-01 2.0E-01 0.0\n"
+    text = moved + heading + points + moved + heading + points.partition(" 2 2")[0]
+    np.testing.assert_allclose(
+        calculix.cell_stresses(text, 2), [[[2, 4, 2, 3], [5, 8, 6, 7]]]
+    )  # xx, xy, yy, zz; the second frame is not whole
+    assert calculix.displacements(text, 1).shape == (2, 1, 2)
+
+
 def test_a_deck_has_the_mesh_twice_its_material_and_its_skin() -> None:
     state = falling_block(0.1, 1.0)
     lines = calculix.deck(state, FEM(UNIT_SQUARE, 2e-3, poisson_ratio=0.25), 5, 20, 0.1).splitlines()
@@ -89,14 +101,19 @@ def test_a_failure_has_the_last_lines_of_the_engine(tmp_path: Path, monkeypatch:
 def test_a_scene_that_the_engine_gives_up_is_tried_with_stiffer_sticking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     state = falling_block(0.1, 1.0)
     rows = "".join(f"{node} 0.25 -0.5 0.0\n" for node in range(1, state.num_nodes + 1))
-    (tmp_path / "found.dat").write_text(f" displacements (vx,vy,vz) for set FRONT\n\n{rows}")
+    stresses = "".join(f"{cell} {point} 2.0 0.0 0.0 0.0 0.0 0.0\n" for cell in range(1, len(state.cells) + 1) for point in (1, 2))  # type: ignore[arg-type]
+    (tmp_path / "found.dat").write_text(f" displacements (vx,vy,vz) for set FRONT\n\n{rows}\n stresses (elem) for set BODY\n\n{stresses}")
     program = tmp_path / "ccx"
     again = f"cp scene.inp {tmp_path}/2.inp; cp {tmp_path}/found.dat scene.dat"
     program.write_text(f"#!/bin/sh\nif [ -e {tmp_path}/1.inp ]; then {again}; else cp scene.inp {tmp_path}/1.inp; fi\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    pos = calculix.run(state, FEM(UNIT_SQUARE, 2e-3), 2)
-    np.testing.assert_allclose(pos[1] - pos[0], np.tile([0.25, -0.5], (state.num_nodes, 1)))
+    motion = calculix.run(state, FEM(UNIT_SQUARE, 2e-3), 2)
+    np.testing.assert_allclose(motion.pos[1] - motion.pos[0], np.tile([0.25, -0.5], (state.num_nodes, 1)))
+    assert motion.stress is not None
+    for stress in (motion.stress.node, motion.stress.cell):
+        assert not stress[0].any()  # the initial state is the rest configuration
+        np.testing.assert_allclose(stress[1], np.tile([2.0, 0.0, 0.0, 0.0], (stress.shape[1], 1)))
     first, second = ((tmp_path / name).read_text().splitlines() for name in ("1.inp", "2.inp"))
     sticking = [float(lines[lines.index("*FRICTION") + 1].split(",")[1]) for lines in (first, second)]
     assert sticking[1] == pytest.approx(10 * sticking[0])
@@ -164,7 +181,7 @@ def test_engine_solver_and_model_are_compared_at_the_same_times(monkeypatch: pyt
     scene = replace(
         engines.SCENES["calculix"],
         start=lambda *_: falling_block(0.1, 1.0),
-        run=lambda _c, _s, count: rising(0, count).pos + np.array([0.0, 0.25]),
+        run=lambda _c, _s, count: Motion(rising(0, count).pos + np.array([0.0, 0.25])),
         seconds=8.0,
     )
     monkeypatch.setitem(engines.SCENES, "calculix", scene)
@@ -180,13 +197,39 @@ def test_calculix_lets_a_block_fall_and_bounce() -> None:
     if calculix.is_missing():
         pytest.skip("ccx is not on the path")
     solver = FEM(UNIT_SQUARE, 2e-3)
-    pos = calculix.run(falling_block(0.02, 1.0), solver, 40)
+    pos = calculix.run(falling_block(0.02, 1.0), solver, 40).pos
     times = 2e-3 * np.arange(8)
     np.testing.assert_allclose(
         pos[:8] - pos[0], np.array([0.0, 1.0]) * (-times - 9.81 / 2 * times**2)[:, None, None] * np.ones((8, 20, 1)), atol=1e-6
     )
     height = pos[..., 1].mean(axis=1)
     assert height[-1] > height.min() + 0.005 and pos[..., 1].min() > -0.1 * SPACING
+
+
+@pytest.mark.slow
+def test_a_body_of_calculix_swings_as_that_of_the_solver_and_has_the_stress_of_its_law() -> None:
+    """A block is released with a velocity that stretches it, and swings in free fall."""
+    if calculix.is_missing():
+        pytest.skip("ccx is not on the path")
+    still = falling_block(0.5, 0.0)
+    pos, solver, count = np.asarray(still.pos), FEM(UNIT_SQUARE, 1e-3), 40
+    own = [replace(still, vel=(pos - pos.mean(axis=0)) * [4.0, 0.0])]
+    motion = calculix.run(own[0], solver, count)
+    while len(own) < count:
+        own.append(solver.step(own[-1]))
+    lengths = [np.ptp(p[..., 0], axis=1) / np.ptp(pos[:, 0]) - 1 for p in (motion.pos, np.stack([np.asarray(state.pos) for state in own]))]
+    first, second, third = ([max(length[k : k + 10]) for length in lengths] for k in (0, 10, 25))
+    assert third[1] < first[1] / 2.5  # damping slows it
+    for swing in (second, third):
+        assert swing[0] / first[0] == pytest.approx(swing[1] / first[1], rel=0.15)
+    mesh = build_mesh(pos, np.asarray(still.cells), np.asarray(still.mass))
+    lam, mu = (np.full(len(mesh.cells), value) for value in lame_parameters(1e6, solver.poisson_ratio))
+    assert motion.stress is not None
+    for frame in range(2, count, 5):
+        expected = cauchy_stress(mesh, motion.pos[frame], lam, mu)
+        for name in ("node", "cell"):
+            found, law = getattr(motion.stress, name)[frame], getattr(expected, name)
+            assert np.linalg.norm(found - law) < 0.02 * np.linalg.norm(law), (frame, name)
 
 
 @pytest.mark.slow
