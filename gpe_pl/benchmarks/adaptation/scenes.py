@@ -45,7 +45,7 @@ class Pair:
     """The same scene by an engine and by the solver.
 
     Attributes:
-        engine: trajectory of the engine, with the mean velocity over the last frame, and with the stress if the engine has one.
+        engine: trajectory of the engine, with its velocities, or mean ones over the last frame, and its stress if it has one.
         solver: positions of the solver [frame, node, dim] in m.
     """
 
@@ -102,7 +102,8 @@ def pair(name: EngineName, candidate: Candidate, seed: int, folder: Path) -> Pai
         lambda: scene.run(candidate, state, count + 1),
     )
     whole = rollout(solver, state, count, candidate.metadata())
-    vel = np.concatenate([np.asarray(state.vel)[None], np.diff(motion.pos, axis=0) / solver.frame_dt])
+    mean = np.concatenate([np.asarray(state.vel)[None], np.diff(motion.pos, axis=0) / solver.frame_dt])
+    vel = mean if motion.vel is None else motion.vel
     stress = None if motion.stress is None else Stress(*(a.astype(np.float32) for a in (motion.stress.node, motion.stress.cell)))
     return Pair(replace(whole, pos=motion.pos.astype(whole.pos.dtype), vel=vel.astype(whole.vel.dtype), stress=stress), whole.pos)
 
@@ -111,11 +112,13 @@ def _kept(path: Path, run: Callable[[], Motion]) -> Motion:
     """Return the motion in a file. If there is none, run the engine and write it."""
     if not path.is_file():
         motion = run()
-        stress = {} if motion.stress is None else {"node_stress": motion.stress.node, "cell_stress": motion.stress.cell}
+        arrays = {"pos": motion.pos, "vel": motion.vel}
+        arrays |= {} if motion.stress is None else {"node_stress": motion.stress.node, "cell_stress": motion.stress.cell}
         with replacing(path) as new, new.open("wb") as file:
-            np.savez(file, pos=motion.pos, **stress)
-    with np.load(path, allow_pickle=False) as arrays:
-        return Motion(arrays["pos"], Stress(arrays["node_stress"], arrays["cell_stress"]) if "cell_stress" in arrays else None)
+            np.savez(file, **{name: values for name, values in arrays.items() if values is not None})  # type: ignore[arg-type]
+    with np.load(path, allow_pickle=False) as stored:
+        stress = Stress(stored["node_stress"], stored["cell_stress"]) if "cell_stress" in stored else None
+        return Motion(stored["pos"], stored.get("vel"), stress)
 
 
 def digest_of(*arrays: np.ndarray) -> str:

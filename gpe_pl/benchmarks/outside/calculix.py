@@ -40,7 +40,7 @@ def is_missing() -> bool:
 
 
 def run(state: State, solver: FEM, num_frames: int) -> Motion:
-    """Return positions and stress of a scene.
+    """Return positions, velocities and stress of a scene.
 
     Args:
         state: one body of triangles above the floor of a box, whose friction is that of the floor. Its cells have no stress.
@@ -57,11 +57,14 @@ def run(state: State, solver: FEM, num_frames: int) -> Motion:
             said = output_of("CalculiX", [PROGRAM, "-i", "scene"], Path(folder), SECONDS)
             table = Path(folder, "scene.dat")
             text = table.read_text(encoding="ascii") if table.is_file() else ""
-        moved, stress = displacements(text, len(pos)), cell_stresses(text, len(cells))
-        if len(moved) == len(stress) == num_frames - 1:
+        moved, vel = (of_nodes(text, quantity, len(pos)) for quantity in ("displacements", "velocities"))
+        stress = cell_stresses(text, len(cells))
+        if len(moved) == len(vel) == len(stress) == num_frames - 1:
             at_cells = np.concatenate([np.zeros_like(stress[:1]), stress])
             averaging = build_mesh(pos, cells, np.asarray(state.mass)).averaging
-            return Motion(np.concatenate([pos[None], pos + moved]), Stress(np.stack([averaging @ frame for frame in at_cells]), at_cells))
+            at_nodes = np.stack([averaging @ frame for frame in at_cells])
+            whole = np.concatenate([pos[None], pos + moved]), np.concatenate([np.asarray(state.vel)[None], vel])
+            return Motion(*whole, Stress(at_nodes, at_cells))
     raise EngineError(f"CalculiX: has {len(moved)} of {num_frames - 1} frames; its last lines are: {last_lines(said)}")
 
 
@@ -80,9 +83,9 @@ def stiffness_damping(viscosity: float, modulus: float, poisson_ratio: float) ->
     return 2 * viscosity * (1 + across**2) * (1 - poisson_ratio**2) / modulus
 
 
-def displacements(text: str, num_nodes: int) -> np.ndarray:
-    """Return displacements [frame, node, 2] in m of the frames that a ``.dat`` file has in full."""
-    return _table(text, "displacements", num_nodes, 4)[:, :, 1:3]
+def of_nodes(text: str, quantity: str, num_nodes: int) -> np.ndarray:
+    """Return ``displacements`` in m or ``velocities`` in m/s [frame, node, 2] of the frames that a ``.dat`` file has in full."""
+    return _table(text, quantity, num_nodes, 4)[:, :, 1:3]
 
 
 def cell_stresses(text: str, num_cells: int) -> np.ndarray:
@@ -165,6 +168,6 @@ def deck(state: State, solver: FEM, num_frames: int, increments: int, sticking: 
         f"{step:.9e}, {(num_frames - 1) * solver.frame_dt:.9e}",
     ]
     lines += ["*DLOAD", f"BODY, GRAV, {gravity:.9e}, {direction[0]:.9e}, {direction[1]:.9e}, 0."]
-    lines += [f"*NODE PRINT, NSET=FRONT, FREQUENCY={increments}", "U"]
+    lines += [f"*NODE PRINT, NSET=FRONT, FREQUENCY={increments}", "U, V"]
     lines += [f"*EL PRINT, ELSET=BODY, FREQUENCY={increments}", "S", "*END STEP", ""]
     return "\n".join(lines)

@@ -24,10 +24,12 @@ class Motion:
 
     Attributes:
         pos: positions [frame, node, dim] in m; the first frame is the initial state.
+        vel: velocities at the frames [frame, node, dim] in m/s; None if the engine does not tell.
         stress: Cauchy stress in Pa with a leading axis of frames; None if the engine has none at nodes of a mesh.
     """
 
     pos: np.ndarray
+    vel: np.ndarray | None = None
     stress: Stress | None = None
 
 

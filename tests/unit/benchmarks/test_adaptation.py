@@ -54,7 +54,9 @@ def engine_that_slides(shift: float, given_up: Sequence[int] = ()) -> Any:
         pos = np.asarray(state.pos) + shift * candidate.spacing * np.arange(num_frames)[:, None, None] * np.eye(state.dim)[0]
         if state.cells is None:
             return Motion(pos)
-        return Motion(pos, Stress(*(np.full((num_frames, count, 4), 1e5) for count in (len(pos[0]), len(state.cells)))))
+        return Motion(
+            pos, np.full(pos.shape, 3.0), Stress(*(np.full((num_frames, count, 4), 1e5) for count in (len(pos[0]), len(state.cells))))
+        )
 
     return run, calls
 
@@ -77,7 +79,7 @@ def test_a_stopped_command_does_not_run_the_engine_again(
     assert again.solver.shape == engine.pos.shape and not np.array_equal(again.solver, engine.pos)
 
 
-def test_the_stress_of_an_engine_is_stored_with_its_scenes(
+def test_velocities_and_stress_of_an_engine_are_stored_with_its_scenes(
     tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, _ = engine_that_slides(0.1)
@@ -92,6 +94,7 @@ def test_the_stress_of_an_engine_is_stored_with_its_scenes(
         for trajectory in iter_trajectories(tmp_path / "data" / name / "imported", split):
             assert trajectory.metadata.with_stress == ("solid",) and trajectory.stress is not None
             assert (trajectory.stress.cell == 1e5).all() and (trajectory.stress.node == 1e5).all()
+            assert (trajectory.vel == 3.0).all()
 
 
 def settings(**changes: Any) -> suite.Settings:

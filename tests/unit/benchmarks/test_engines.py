@@ -59,10 +59,12 @@ def column_of_sand(friction_angle: float) -> State:
     )  # fmt: skip
 
 
-def test_displacements_are_read_by_frame_and_node() -> None:
+def test_displacements_and_velocities_are_read_by_frame_and_node() -> None:
     table = "\n displacements (vx,vy,vz) for set FRONT and time  0.1E-02\n\n 1 1.0E-01 2.0E-01 0.0\n 2 3.0E-01 4.0E-01 0.0\n\n"
-    frames = calculix.displacements(table + table.replace("1.0E-01", "5.0E-01") + table.partition(" 2 ")[0], 2)
-    np.testing.assert_allclose(frames, [[[0.1, 0.2], [0.3, 0.4]], [[0.5, 0.2], [0.3, 0.4]]])
+    fast = table.replace("displacements", "velocities").replace("E-01", "E+01")
+    text = table + fast + table.replace("1.0E-01", "5.0E-01") + table.partition(" 2 ")[0]
+    np.testing.assert_allclose(calculix.of_nodes(text, "displacements", 2), [[[0.1, 0.2], [0.3, 0.4]], [[0.5, 0.2], [0.3, 0.4]]])
+    np.testing.assert_allclose(calculix.of_nodes(text, "velocities", 2), [[[10, 20], [30, 40]]])
 
 
 def test_the_stress_of_a_cell_is_the_mean_of_its_two_points_in_the_order_of_states() -> None:
@@ -73,7 +75,7 @@ def test_the_stress_of_a_cell_is_the_mean_of_its_two_points_in_the_order_of_stat
     np.testing.assert_allclose(
         calculix.cell_stresses(text, 2), [[[2, 4, 2, 3], [5, 8, 6, 7]]]
     )  # xx, xy, yy, zz; the second frame is not whole
-    assert calculix.displacements(text, 1).shape == (2, 1, 2)
+    assert calculix.of_nodes(text, "displacements", 1).shape == (2, 1, 2)
 
 
 def test_a_deck_has_the_mesh_twice_its_material_and_its_skin() -> None:
@@ -102,7 +104,8 @@ def test_a_scene_that_the_engine_gives_up_is_tried_with_stiffer_sticking(tmp_pat
     state = falling_block(0.1, 1.0)
     rows = "".join(f"{node} 0.25 -0.5 0.0\n" for node in range(1, state.num_nodes + 1))
     stresses = "".join(f"{cell} {point} 2.0 0.0 0.0 0.0 0.0 0.0\n" for cell in range(1, len(state.cells) + 1) for point in (1, 2))  # type: ignore[arg-type]
-    (tmp_path / "found.dat").write_text(f" displacements (vx,vy,vz) for set FRONT\n\n{rows}\n stresses (elem) for set BODY\n\n{stresses}")
+    tables = {"displacements": rows, "velocities": rows, "stresses": stresses}
+    (tmp_path / "found.dat").write_text("".join(f" {quantity} for set X\n\n{lines}\n" for quantity, lines in tables.items()))
     program = tmp_path / "ccx"
     again = f"cp scene.inp {tmp_path}/2.inp; cp {tmp_path}/found.dat scene.dat"
     program.write_text(f"#!/bin/sh\nif [ -e {tmp_path}/1.inp ]; then {again}; else cp scene.inp {tmp_path}/1.inp; fi\n")
@@ -110,7 +113,9 @@ def test_a_scene_that_the_engine_gives_up_is_tried_with_stiffer_sticking(tmp_pat
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     motion = calculix.run(state, FEM(UNIT_SQUARE, 2e-3), 2)
     np.testing.assert_allclose(motion.pos[1] - motion.pos[0], np.tile([0.25, -0.5], (state.num_nodes, 1)))
-    assert motion.stress is not None
+    assert motion.stress is not None and motion.vel is not None
+    np.testing.assert_array_equal(motion.vel[0], state.vel)
+    np.testing.assert_allclose(motion.vel[1], motion.pos[1] - motion.pos[0])  # the same numbers in the file
     for stress in (motion.stress.node, motion.stress.cell):
         assert not stress[0].any()  # the initial state is the rest configuration
         np.testing.assert_allclose(stress[1], np.tile([2.0, 0.0, 0.0, 0.0], (stress.shape[1], 1)))
@@ -224,7 +229,9 @@ def test_a_body_of_calculix_swings_as_that_of_the_solver_and_has_the_stress_of_i
         assert swing[0] / first[0] == pytest.approx(swing[1] / first[1], rel=0.15)
     mesh = build_mesh(pos, np.asarray(still.cells), np.asarray(still.mass))
     lam, mu = (np.full(len(mesh.cells), value) for value in lame_parameters(1e6, solver.poisson_ratio))
-    assert motion.stress is not None
+    assert motion.stress is not None and motion.vel is not None
+    between = (motion.pos[2:] - motion.pos[:-2]) / 2e-3
+    assert np.linalg.norm(motion.vel[1:-1] - between) < 0.05 * np.linalg.norm(between)
     for frame in range(2, count, 5):
         expected = cauchy_stress(mesh, motion.pos[frame], lam, mu)
         for name in ("node", "cell"):
