@@ -171,7 +171,8 @@ class FitRun:
             best.parent.mkdir(parents=True, exist_ok=True)
             self._new_module(self.training).simulator.save(best)
             return best
-        best = train(self._new_module(self.training), self._data, self.training, self.trainer, self._loggers, self.folder, self.callbacks)
+        module, is_trained = self._new_module(self.training), self.start is not None
+        best = train(module, self._data, self.training, self.trainer, self._loggers, self.folder, self.callbacks, is_trained)
         end_later_processes()
         return best
 

@@ -102,13 +102,18 @@ class RolloutValidation(Callback):
         simulator: Any = pl_module.simulator
         if trainer.sanity_checking:
             return
+        pairs = self.measured(simulator)
+        for name, value in {"rollout_mse": float(np.mean(self.errors)), **self._shapes(pairs)}.items():
+            pl_module.log(f"val/{name}", value, sync_dist=True)  # equal on all ranks; Lightning warns without sync_dist
+
+    def measured(self, simulator: LearnedSimulator) -> list[tuple[Trajectory, Trajectory]]:
+        """Set ``errors`` to those of a simulator, and return prediction and ground truth of this rank's trajectories."""
         was_training = simulator.training
         simulator.eval()
         pairs = self._rollouts(simulator)
         simulator.train(was_training)
         self.errors = self._errors(pairs)
-        for name, value in {"rollout_mse": float(np.mean(self.errors)), **self._shapes(pairs)}.items():
-            pl_module.log(f"val/{name}", value, sync_dist=True)  # equal on all ranks; Lightning warns without sync_dist
+        return pairs
 
     def _rollouts(self, simulator: LearnedSimulator) -> list[tuple[Trajectory, Trajectory]]:
         """Return prediction and ground truth of this rank's trajectories."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -22,6 +23,8 @@ from gpe_pl.learned.checkpoint_file import CheckpointError, load_checkpoint, rea
 from gpe_pl.system import ranks
 from gpe_pl.training.callbacks import RolloutValidation
 from gpe_pl.training.interruption import Interruption
+
+log = logging.getLogger(__name__)
 
 NUM_STANDARD_ERRORS = 2.0
 """How far above the lowest mean error a validation has to be, in standard errors, to be clearly worse."""
@@ -55,17 +58,20 @@ class Checkpoints(Checkpoint):
         seconds: time from one ``last.ckpt`` to the next between validations [s].
         interruption: notes signals from the first step on. After one, ``last.ckpt`` is saved and training ends with ``KeyboardInterrupt``.
         validation: has the errors of the last validation.
+        starts_trained: whether the model has been trained before. It is then validated before the first step, too, and is ``best.ckpt`` at first.
 
     Attributes:
-        best_step: training step of ``best.ckpt``; None if there is none.
+        best_step: training step of ``best.ckpt``, 0 for the model before the first step; None if there is none.
         lowest: errors [m², trajectory] of the validation with the lowest mean; None before the first one.
         saved_step: training step of ``last.ckpt``; None if this process has neither loaded nor saved it.
         has_begun: whether a training step has begun. By then, all of ``last.ckpt`` has been restored.
     """
 
-    def __init__(self, folder: Path, seconds: float, interruption: Interruption, validation: RolloutValidation) -> None:
+    def __init__(
+        self, folder: Path, seconds: float, interruption: Interruption, validation: RolloutValidation, starts_trained: bool = False
+    ) -> None:
         self.best, self.last = folder / "best.ckpt", folder / "last.ckpt"
-        self.seconds, self.interruption, self.validation = seconds, interruption, validation
+        self.seconds, self.interruption, self.validation, self.starts_trained = seconds, interruption, validation, starts_trained
         self.best_step: int | None = None
         self.lowest: list[float] | None = None
         self.saved_step: int | None = None
@@ -83,6 +89,11 @@ class Checkpoints(Checkpoint):
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self.has_begun, self._saved_at = True, time.monotonic()
         self.interruption.listen()
+        if self.starts_trained and trainer.global_step == 0:
+            simulator: Any = pl_module.simulator
+            self.validation.measured(simulator)
+            self._keep(trainer, self.validation.errors)
+            log.info("before the first step: rollout MSE %.3g m² on validation trajectories", np.mean(self.validation.errors))
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int) -> None:
         interval = trainer.val_check_batch
@@ -97,15 +108,17 @@ class Checkpoints(Checkpoint):
             raise KeyboardInterrupt
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        errors = self.validation.errors
-        is_better = self.lowest is None or float(np.mean(errors)) < float(np.mean(self.lowest))
-        if self.lowest is None or not clearly_worse(errors, self.lowest):
-            self.best_step = trainer.global_step
-            self.lowest = errors if is_better else self.lowest
-            trainer.save_checkpoint(self.best, weights_only=False)
+        if self.lowest is None or not clearly_worse(self.validation.errors, self.lowest):
+            self._keep(trainer, self.validation.errors)
         self._save_last(trainer)
         if self._agreed(pl_module, self.interruption.requested)[0]:
             raise KeyboardInterrupt
+
+    def _keep(self, trainer: L.Trainer, errors: list[float]) -> None:
+        self.best_step = trainer.global_step
+        if self.lowest is None or float(np.mean(errors)) < float(np.mean(self.lowest)):
+            self.lowest = errors
+        trainer.save_checkpoint(self.best, weights_only=False)
 
     def _save_last(self, trainer: L.Trainer) -> None:
         trainer.save_checkpoint(self.last, weights_only=False)

@@ -207,6 +207,7 @@ def train(
     loggers: list[Logger],
     run_dir: Path,
     callbacks: Sequence[Callback] = (),
+    starts_trained: bool = False,
 ) -> Path:
     """Train up to step ``num_steps``, from ``checkpoints/last.ckpt`` if there is one, else from the start.
 
@@ -221,6 +222,7 @@ def train(
         loggers: loggers of losses and metrics.
         run_dir: folder of the run.
         callbacks: callbacks of Lightning beyond those of every run.
+        starts_trained: whether the model has been trained before. It is validated before the first step, too, and stays the best one unless a later one is.
 
     Returns:
         Path of the best checkpoint; see ``Checkpoints``.
@@ -236,7 +238,7 @@ def train(
     steps = min(training.val_rollout_steps, shortest - datamodule.builder.config.history - 1)
     averages = [] if training.ema_decay is None else [WarmAverage(training.ema_decay)]
     validation = RolloutValidation(datamodule.val_trajectories(training.num_val_rollouts), steps, training.val_containment)
-    checkpoints = Checkpoints(run_dir / "checkpoints", 60 * trainer_settings.checkpoint_minutes, interruption, validation)
+    checkpoints = Checkpoints(run_dir / "checkpoints", 60 * trainer_settings.checkpoint_minutes, interruption, validation, starts_trained)
     own: list[Callback] = [
         validation,
         *averages,
@@ -269,6 +271,13 @@ def train(
         raise TrainingError(
             f"{error}; {'no checkpoint was saved yet' if saved is None else f'the last good checkpoint is kept: {saved}'}"
         ) from None
+    if checkpoints.best_step == 0:
+        log.warning(
+            "start_from: every validation was clearly worse than the model at the start, so %s is that model; the trained one is %s. "
+            "Try a lower training.learning_rate or more trajectories",
+            checkpoints.best,
+            checkpoints.last,
+        )
     return checkpoints.best
 
 

@@ -61,7 +61,7 @@ def data(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> Path:
 def errors(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[float]]:
     """Set the result of the validation after each step; later ones are worse."""
     found = {3: [1.0], 6: [2.0], 9: [3.0]}
-    steps: list[int] = []
+    steps: list[int] = [0]
     monkeypatch.setattr(RolloutValidation, "_errors", lambda *_: found[steps[-1]])
     plain = RolloutValidation.on_validation_epoch_end
 
@@ -85,7 +85,12 @@ def _signals() -> Iterator[None]:
 
 
 def trained(
-    root: Path, run: Path, push_fraction: float = 0.0, minutes: float = math.inf, at: dict[int, Callable[[], None]] | None = None
+    root: Path,
+    run: Path,
+    push_fraction: float = 0.0,
+    minutes: float = math.inf,
+    at: dict[int, Callable[[], None]] | None = None,
+    starts_trained: bool = False,
 ) -> Path:
     """Train in a folder, or resume; ``at`` acts before steps."""
 
@@ -110,7 +115,7 @@ def trained(
     module = Disturbed(simulator, STEPS, warmup_steps=2, compile="off")
     run.mkdir(parents=True, exist_ok=True)
     trainer = TrainerSettings(progress=False, checkpoint_minutes=minutes)
-    return train(module, module_data, settings, trainer, [CSVLogger(run, name="log")], run)
+    return train(module, module_data, settings, trainer, [CSVLogger(run, name="log")], run, starts_trained=starts_trained)
 
 
 def stop(error: type[BaseException]) -> Callable[[], None]:
@@ -133,6 +138,26 @@ def assert_like(run: Path, whole: Path) -> None:
     for name in ("last", "best"):
         assert_same_checkpoint(stored(run, name), stored(whole, name))
     assert stored(run)["callbacks"]["Checkpoints"] == stored(whole)["callbacks"]["Checkpoints"]
+
+
+@pytest.mark.parametrize("stops_at", [None, 2, 7])
+def test_a_trained_model_stays_the_best_unless_a_later_one_is(
+    stops_at: int | None, data: Path, tmp_path: Path, errors: dict[int, list[float]], caplog: pytest.LogCaptureFixture
+) -> None:
+    """The validation before the first step has an error of ``start``, and the first of the later ones the lowest of theirs."""
+    for name, start, best in (("better", 0.5, 0), ("worse", 1.5, 3)):
+        errors[0] = [start]
+        if stops_at is not None:
+            with pytest.raises(RunError, match="interrupted"):
+                trained(data, tmp_path / name, at={stops_at: send(signal.SIGINT)}, starts_trained=True)
+        caplog.clear()
+        trained(data, tmp_path / name, starts_trained=True)
+        assert stored(tmp_path / name, "best")["global_step"] == best
+        assert stored(tmp_path / name)["global_step"] == STEPS
+        assert stored(tmp_path / name)["callbacks"]["Checkpoints"] == {"best_step": best, "lowest": [min(start, 1.0)]}
+        assert ("every validation was clearly worse than the model at the start" in caplog.text) == (best == 0)
+    start_weights, averaged = (stored(tmp_path / "better", "best")[key] for key in ("current_model_state", "state_dict"))
+    assert all(torch.equal(start_weights[key], value) for key, value in averaged.items())  # no step has changed them
 
 
 def test_a_run_that_was_moved_knows_its_best_checkpoint(data: Path, tmp_path: Path, errors: dict[int, list[float]]) -> None:
