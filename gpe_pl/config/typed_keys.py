@@ -22,6 +22,7 @@ UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "training.push_correction": ("training.push_fraction", lambda fraction: fraction == 0),
     "training.stress_loss": ("model.stress", lambda stress: stress is False),
     "training.stress_weight": ("model.stress", lambda stress: stress is False),
+    "model.stress_unit": ("model.stress", lambda stress: stress is False),
     "model.wall_distance": ("model.elastic", lambda elastic: elastic is False),
     "model.wall_layer": ("model.elastic", lambda elastic: elastic is False),
     "model.only_contacts": ("model.elastic", lambda elastic: elastic is False),

@@ -8,7 +8,7 @@ elastic law and integration are not part of it. Its inputs are
 - ``edges.SOURCE.NAME.TARGET`` rows of source and target [2, edge], with ``odd.…`` and ``even.…`` features [edge, channel]
 
 All levels of virtual nodes are one type ``grid`` if they share weights. Its outputs are ``acceleration.MATERIAL``, ``stress.MATERIAL`` and
-``contact.MATERIAL``.
+``contact.MATERIAL``. With ``stress_unit="strain"`` the stress is that per strain.
 """
 
 from __future__ import annotations

@@ -30,12 +30,14 @@ from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_proces
 from gpe_pl.nn.island_momentum import IslandMomentum, conserve, grouped, joined, moved_by_contacts
 from gpe_pl.nn.momentum_conv import RAW, EdgeState, Implementation, Interaction, MomentumConv, orient
 from gpe_pl.nn.node_loads import loads_of, plus, without_held_bodies
+from gpe_pl.nn.strain_scale import StrainScale
 from gpe_pl.schema import BOUNDARY, CELL, MESH_MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
 Decoder = Literal["node", "pair", "contact"]
 LevelWeights = Literal["shared", "separate"]
 MaterialEmbeddingKind = Literal["affine", "mlp", "none"]
 NodeNorm = Literal["none", "layer"]
+StressUnit = Literal["data", "strain"]
 
 
 class StressError(GpeError, ValueError):
@@ -168,6 +170,8 @@ class GPE(Model):
         wall_layer: with ``elastic``, initial thickness of the learned elastic layer of walls in front of that, in rest spacings; 0 stands for no layer.
         only_contacts: with ``elastic`` and the ``contact`` decoder, the network adds forces between bodies, and nothing within bodies or at walls.
         viscous: with ``elastic``, cells also have a viscous stress with a learned constant. Choose false for data of solids without damping.
+        stress_unit: with ``stress`` and without ``elastic``, what the network decodes: the stress in the unit of the data set, or with ``strain`` the stress
+            per strain of its scene (see ``nn.strain_scale``).
         island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or
             ``ignored``.
 
@@ -175,7 +179,7 @@ class GPE(Model):
         StressError: ``stress`` without a material that has a stress.
         IslandError: graphs do not contain islands and bodies, which ``island_momentum`` and the ``contact`` decoder with meshes need; or the ``contact``
             decoder is used with meshes beside other materials and without ``island_momentum``.
-        CellError: ``elastic`` without cells in the graphs.
+        CellError: ``elastic`` or ``stress_unit="strain"`` without cells in the graphs, or both together.
     """
 
     def __init__(
@@ -197,6 +201,7 @@ class GPE(Model):
         wall_layer: Annotated[float, Field(ge=0)] = 0.0,
         only_contacts: bool = False,
         viscous: bool = True,
+        stress_unit: StressUnit = "data",
     ) -> None:
         super().__init__(
             spec,
@@ -216,11 +221,16 @@ class GPE(Model):
             wall_layer=wall_layer,
             only_contacts=only_contacts,
             viscous=viscous,
+            stress_unit=stress_unit,
         )
         if elastic and not (spec.cells and spec.meshes and spec.islands):
             raise CellError(
                 "model.elastic=true needs graph.cells=true graph.mesh=true graph.islands=true and a material with cells, "
                 f"such as {MESH_MATERIALS[0]}; the data set has {', '.join(spec.materials)}; or choose law=none"
+            )
+        if stress_unit == "strain" and (elastic or not (stress and spec.cells and spec.meshes)):
+            raise CellError(
+                "model.stress_unit=strain needs model.stress=true model.elastic=false graph.cells=true and a material with cells"
             )
         if island_momentum != "ignored" and not spec.islands:
             raise IslandError(f"model.island_momentum={island_momentum} needs graph.islands=true")
@@ -292,10 +302,14 @@ class GPE(Model):
         if stress:
             decoded = {m: c for m, c in spec.stress_channels.items() if not (elastic and m in spec.meshes)}  # the law knows the others'
             self.stress_decoder = nn.ModuleDict({m: mlp(hidden, hidden, c) for m, c in decoded.items()})
+        if stress_unit == "strain":
+            self.strain_scale = StrainScale(tuple(m for m in spec.meshes if m in spec.stress_channels), spec.dim)
 
     def set_units(self, acceleration: float, spacing: float, stress: float) -> None:
         if self.settings["elastic"]:
             self.elastic_bodies.set_units(acceleration, spacing, stress)
+        if self.settings["stress_unit"] == "strain":
+            self.strain_scale.set_units(acceleration)
 
     def early_layers(self, num_steps: int) -> list[nn.Module]:
         constants = [self.elastic_bodies] if self.settings["elastic"] else []
@@ -358,6 +372,10 @@ class GPE(Model):
             with_stress = self._wants_stress and bool(self.spec.stress_channels)
             acceleration, velocity, of_law = self.elastic_bodies(data, acceleration, params, mass, with_stress)
             stress = stress | of_law
+        elif self.settings["stress_unit"] == "strain":
+            stress = {
+                m: s * self.strain_scale(data, m, acceleration[m]) if m in self.strain_scale.typical else s for m, s in stress.items()
+            }
         return Prediction(acceleration, stress, velocity)
 
     def _compiled(self, data: HeteroData, keep_absent: bool) -> Decoded | None:

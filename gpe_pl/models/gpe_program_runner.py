@@ -69,8 +69,8 @@ class GPEProgramRunner:
     def __init__(self, model: GPE) -> None:
         modules = [*model.modules()]
         layers = [
-            m for name, m in model.named_modules() if name.partition(".")[0] not in ("", "elastic_bodies")
-        ]  # the law is no part of the program
+            m for name, m in model.named_modules() if name.partition(".")[0] not in ("", "elastic_bodies", "strain_scale")
+        ]  # the law and the strain are no parts of the program
         self._hooks = [hooks for m in modules[1:] for hooks in (m._forward_hooks, m._forward_pre_hooks)]
         self._attributes = [vars(m) for m in layers]
         self._unknown = next(

@@ -171,7 +171,7 @@ class ElasticBodies(nn.Module):
         body_pos, (mean, velocity) = store["body_pos"], store["velocity"].double().split(self.dim, dim=1)
         gravity = data.gravity.to(device).double()
         gravity = gravity if scene is None else gravity[scene]
-        cells = _cells_at_rest(m, store["cell_index"], store["rest_pos"], mass.to(device), scene)
+        cells = cells_at_rest(m, store["cell_index"], store["rest_pos"], mass.to(device), scene)
         # masses are in units of their mean, and the rest volume of a node is about spacing^dim
         modulus = spacing ** (2 - self.dim)
         of_node = [value.to(device) for value in constants]
@@ -196,7 +196,7 @@ class ElasticBodies(nn.Module):
         store = data[m]
         host = {key: store[key].cpu() for key in ENTRIES}
         mass_on_host, scene = mass.cpu(), store.batch.cpu() if "batch" in store else None
-        cells = _cells_at_rest(m, host["cell_index"], host["rest_pos"], mass_on_host, scene)
+        cells = cells_at_rest(m, host["cell_index"], host["rest_pos"], mass_on_host, scene)
         law = cast(Constants, self.constants[m]).logarithm
         units = [self.acceleration_unit, self.spacing, self.stress_unit, self.log_friction[m].exp(), self.wall_distance[m] * self.spacing]
         thickness, *others = cast(WallLayer, self.wall_layer[m]).values()
@@ -220,7 +220,7 @@ def _array(x: Tensor) -> np.ndarray:
     return np.ascontiguousarray(x.detach().cpu().numpy())
 
 
-def _cells_at_rest(material: str, cell_index: Tensor, rest_pos: Tensor, mass: Tensor, scene: Tensor | None) -> Cells:
+def cells_at_rest(material: str, cell_index: Tensor, rest_pos: Tensor, mass: Tensor, scene: Tensor | None) -> Cells:
     """Return the cells of a graph at rest. They are computed once for equal arrays, because only positions and velocities change in a rollout.
 
     Raises:

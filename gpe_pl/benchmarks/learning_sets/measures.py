@@ -38,15 +38,17 @@ def pooled(quantity: str, table: np.ndarray, axis: Axes = (-2, -1)) -> Any:
     return POOLED_BY.get(quantity, lambda own, axis: own.mean(axis=axis))(table, axis)
 
 
-def measured(checkpoint: Path, root: Path, learning_set: LearningSet) -> dict[str, dict[str, list[float]]]:
+def measured(checkpoint: Path, root: Path, learning_set: LearningSet, mirror_average: bool) -> dict[str, dict[str, list[float]]]:
     """Return the quantities of each trajectory of the test split by simulator and name: of a trained model, and of the trivial baselines.
 
     Args:
         checkpoint: the trained model.
         root: folder of the imported data set.
         learning_set: start and metrics.
+        mirror_average: whether the model averages each step over the scene and its mirror images (``learned.mirror_average``).
     """
     simulator, found = LearnedSimulator.from_checkpoint(checkpoint), dict[str, dict[str, list[float]]]()
+    simulator.mirror_average = mirror_average
     settings = EvaluationSettings(splits=["test"], num_uncontained=0, num_pictures=0)
     for scene in Predictor(simulator, settings, MODEL, None, 1, learning_set.start, seconds=[]).scenes(root, "test"):
         for name, prediction in scene.predictions.items():

@@ -28,6 +28,7 @@ from gpe_pl.data.importers.report import Report
 from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
+from gpe_pl.files.run_folder import CONFIG, config_in
 from gpe_pl.metrics.rollouts import bootstrap_interval
 
 RESUMES = True
@@ -159,7 +160,8 @@ def _trained(name: SetName, label: str, dataset: str, seed: int, folder: Path, s
     digest = sha256(checkpoint.read_bytes()).hexdigest()
     stored = folder / "runs" / run_name / MEASURED_FILE
     if not stored.is_file() or json.loads(stored.read_text(encoding="utf-8"))["checkpoint"] != digest:
-        values = measured(checkpoint, root, learning_set)
+        own = config_in(folder / "runs" / run_name / CONFIG)["evaluation"]
+        values = measured(checkpoint, root, learning_set, bool(own["mirror_average"]))
         about_run = {"set": name, "split": label, "seed": seed, "minutes": settings.minutes, "training": overrides}
         record = {**about_run, "values": values, "checkpoint": digest}
         replace_text(stored, json.dumps(record) + "\n")

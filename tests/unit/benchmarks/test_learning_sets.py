@@ -17,10 +17,12 @@ import pytest
 from gpe_pl.benchmarks.learning_sets import measures, suite
 from gpe_pl.benchmarks.learning_sets.sets import FULL, ONE_STEP, POSITION, RIGIDITY, SETS, SPACING, STRESS, VELOCITY, SetName
 from gpe_pl.data.importers.source import ImportFailure
+from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import iter_trajectories
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests import sources
@@ -101,8 +103,18 @@ def falls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "files"
 
 
-def test_every_split_is_trained_and_measured_once(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    commands = []
+@pytest.mark.parametrize("averages", [None, True])
+def test_every_split_is_trained_and_measured_once(
+    averages: bool | None, tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commands, averaged = [], []
+    step_all = LearnedSimulator.step_all
+
+    def watched(simulator: LearnedSimulator, states: list[State]) -> Any:
+        averaged.append(simulator.mirror_average)
+        return step_all(simulator, states)
+
+    monkeypatch.setattr(LearnedSimulator, "step_all", watched)
 
     def trained(command: list[str], check: bool) -> SimpleNamespace:
         values = dict(argument.split("=", 1) for argument in command[3:])
@@ -112,6 +124,7 @@ def test_every_split_is_trained_and_measured_once(tmp_path: Path, falls: Path, m
         checkpoint = Path(values["paths.runs"]) / values["name"] / "checkpoints" / "best.ckpt"
         checkpoint.parent.mkdir(parents=True, exist_ok=True)
         LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=4), builder).save(checkpoint)
+        sealed.write(checkpoint.parents[1] / "config.json", {"evaluation": {"mirror_average": averages}})
         return SimpleNamespace(returncode=0)
 
     monkeypatch.setattr(subprocess, "run", trained)
@@ -126,6 +139,7 @@ def test_every_split_is_trained_and_measured_once(tmp_path: Path, falls: Path, m
     assert records[0]["values"]["model"].keys() == {FULL, ONE_STEP, SPACING}
     assert records[0]["values"]["constant_velocity"][ONE_STEP][0] < records[0]["values"]["constant_velocity"][FULL][0]
     assert "| 2 of 5 | 3 | 0.5 |" in text and "beam: put" in text
+    assert {*averaged} == {bool(averages)}
 
 
 def test_a_training_that_fails_names_its_command(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
