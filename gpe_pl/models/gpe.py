@@ -373,9 +373,7 @@ class GPE(Model):
             acceleration, velocity, of_law = self.elastic_bodies(data, acceleration, params, mass, with_stress)
             stress = stress | of_law
         elif self.settings["stress_unit"] == "strain":
-            stress = {
-                m: s * self.strain_scale(data, m, acceleration[m]) if m in self.strain_scale.typical else s for m, s in stress.items()
-            }
+            stress = self.strain_scale(data, acceleration, stress)
         return Prediction(acceleration, stress, velocity)
 
     def _compiled(self, data: HeteroData, keep_absent: bool) -> Decoded | None:

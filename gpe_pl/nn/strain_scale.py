@@ -43,17 +43,22 @@ class StrainScale(nn.Module):
         """Set the unit of predicted accelerations [m/frame²]."""
         self.acceleration_unit.fill_(acceleration)
 
-    def forward(self, data: HeteroData, material: str, acceleration: Tensor) -> Float[Tensor, "node 1"]:
-        """Return the scale at each node of a material.
+    def forward(
+        self, data: HeteroData, acceleration: dict[str, Tensor], stress: dict[str, Tensor]
+    ) -> dict[str, Float[Tensor, "node component"]]:
+        """Return the stress of each material after the step.
 
         Args:
             data: graph.
-            material: one of ``materials``.
-            acceleration: predicted accelerations without gravity [node, dim], in the unit of accelerations.
+            acceleration: predicted accelerations without gravity of each material [node, dim], in the unit of accelerations.
+            stress: stress per strain of each material [node, component]; that of materials without cells stays as it is.
 
         Raises:
             CellError: PyTorch Geometric joined the graphs.
         """
+        return {m: s * self._scale(data, m, acceleration[m]) if m in self.typical else s for m, s in stress.items()}
+
+    def _scale(self, data: HeteroData, material: str, acceleration: Tensor) -> Float[Tensor, "node 1"]:
         store = data[material]
         if "ptr" in store:
             raise CellError("PyTorch Geometric's Batch does not renumber cells; join graphs with gpe_pl.graphs.batching.batched")
