@@ -2,7 +2,7 @@
 
 The stress of a body that is hardly deformed is small. A network that decodes stress in one unit for all frames has an error there that fits large stresses.
 Here the network decodes the stress per strain of its scene, which has the same size in all frames. The strain is taken at the positions that the network
-predicts, because these are known far better than the stress. A body without strain has no stress.
+predicts, because these are known far better than the stress. A scene without strain has no stress.
 """
 
 from __future__ import annotations

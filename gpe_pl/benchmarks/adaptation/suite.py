@@ -150,7 +150,7 @@ def _made(name: EngineName, candidate: Candidate, settings: Settings, folder: Pa
 def _stored(name: EngineName, pairs: Sequence[Pair], settings: Settings, folder: Path) -> str:
     """Write the engine's scenes as a data set, unless an earlier run has done so, and return its name, which other scenes or splits do not share."""
     trajectories, num_held_out = [p.engine for p in pairs], settings.num_val + settings.num_test
-    dataset = f"{name}_{digest_of(np.array([settings.num_train, settings.num_val]), *(t.pos for t in trajectories))}"
+    dataset = f"{name}_{digest_of(np.array([settings.num_train, settings.num_val]), *(a for t in trajectories for a in (t.pos, t.vel)))}"
     if not (folder / "data" / dataset / FOLDER).is_dir():
         train, val, test = (
             trajectories[:-num_held_out],
