@@ -55,7 +55,7 @@ log = logging.getLogger(__name__)
 
 OPTIMISATION = (
     *("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps"),
-    *("loss", "stress_loss", "stress_weight", "neighbor_weight", "compile"),
+    *("loss", "stress_loss", "stress_weight", "neighbor_weight", "compile", "cuda_graph"),
 )
 """Fields of ``TrainingSettings`` that are arguments of ``TrainingModule``."""
 

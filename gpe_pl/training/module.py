@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Annotated, Any, Literal
 
@@ -26,6 +26,7 @@ from gpe_pl.models.base import Prediction
 from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.system import ranks
 from gpe_pl.system.machine import has_cpp_compiler
+from gpe_pl.training.cuda_graph import CudaGraphs
 from gpe_pl.training.loss_terms import LEAST_ERROR, Loss, StressLoss, num_neighbors, penalty, stress_error
 from gpe_pl.training.optimizer import OnePassAdam, clip
 from gpe_pl.training.push_forward import Excursions
@@ -33,6 +34,7 @@ from gpe_pl.training.unroll_gradients import predictions
 
 Schedule = Literal["cosine", "exponential", "staircase"]
 Compile = Literal["auto", "on", "off"]
+CudaGraph = Literal["auto", "off"]
 
 MAX_SKIPPED, SKIP_WINDOW, MAX_IN_ROW = 10, 100, 3
 """Limits on skipped batches, whose loss or gradient is not finite. More than ``MAX_SKIPPED`` within ``SKIP_WINDOW`` steps, or ``MAX_IN_ROW`` in a row, stop the
@@ -82,6 +84,7 @@ class TrainingModule(L.LightningModule):
         mean_neighbors: n̄, the mean number of neighbours of a node in the training data.
         compile: whether to apply ``torch.compile`` to the model. ``auto`` compiles if the run is long enough, the model has no fused passes for the device
             (``is_fused``, on a CPU) and a C++ compiler is found.
+        cuda_graph: whether training steps use CUDA graphs of the model. ``auto`` does so on a GPU in runs of one process; see ``training.cuda_graph``.
     """
 
     def __init__(
@@ -98,6 +101,7 @@ class TrainingModule(L.LightningModule):
         neighbor_weight: Annotated[float, Field(gt=0, le=10)] | None = None,
         mean_neighbors: Annotated[float, Field(gt=0)] = 1.0,
         compile: Compile = "auto",
+        cuda_graph: CudaGraph = "auto",
     ) -> None:
         super().__init__()
         self.simulator = simulator
@@ -107,9 +111,11 @@ class TrainingModule(L.LightningModule):
         self.stress_loss: StressLoss = stress_loss
         self.stress_weight, self.neighbor_weight, self.mean_neighbors = stress_weight, neighbor_weight, mean_neighbors
         self.compile_mode: Compile = compile
+        self.cuda_graph: CudaGraph = cuda_graph
         self.val_nmse = OneStepNMSE()
         self._excursions = Excursions()
         self._compilation = ExitStack()
+        self._graphs: CudaGraphs | None = None  # inside ``compiled``
         self._windows: list[tuple[int, int]] = []  # (trajectory, frame) of the current batch
         self._skipped: deque[int] = deque(maxlen=MAX_SKIPPED)  # the last steps without an update
 
@@ -139,19 +145,36 @@ class TrainingModule(L.LightningModule):
 
     @contextmanager
     def compiled(self) -> Iterator[None]:
-        """Run the model's ``compute`` through ``torch.compile`` in training steps inside this context, if ``compile`` asks for it and it works here."""
+        """Run the model's ``compute`` through ``torch.compile`` and as CUDA graphs in training steps inside this context, where the settings say so."""
         model = self.simulator.model
+        plain = compute = model.compute
+        if self._wants_compilation():
+            compute = self._compiled(plain)
+        if self.cuda_graph == "auto" and self.device.type == "cuda" and ranks.num_ranks() == 1:
+            compute = self._graphs = CudaGraphs(model, compute)
+        if compute is plain:
+            yield
+            return
+        model.compute = compute
+        try:
+            yield
+        finally:
+            self._graphs = None
+            del model.compute  # leaves the method of the class
+
+    def _wants_compilation(self) -> bool:
+        """Tell whether ``compile`` asks for ``torch.compile``, and it works here."""
         is_long = self.num_steps - self.global_step >= COMPILE_PAYS_AFTER
-        is_fast_already = self.device.type == "cpu" and model.is_fused
+        is_fast_already = self.device.type == "cpu" and self.simulator.model.is_fused
         wanted = self.compile_mode == "on" or (self.compile_mode == "auto" and is_long and not is_fast_already)
         if wanted and self.compile_mode == "auto" and not has_cpp_compiler():
             log.warning("compile: auto found no C++ compiler; training runs without torch.compile")
-            wanted = False
-        if not wanted:
-            yield
-            return
-        plain, fast = model.compute, torch.compile(model.compute, dynamic=True)
-        compiler_works = True
+            return False
+        return wanted
+
+    def _compiled(self, plain: Callable[..., Any]) -> Callable[..., Any]:
+        """Return ``compute`` of the model, compiled for training steps."""
+        fast, compiler_works = torch.compile(plain, dynamic=True), True
 
         def compute(*args: Any) -> Any:
             # only training steps, and no sizes of one: the compiler would specialise on them and recompile until it gives up
@@ -166,11 +189,7 @@ class TrainingModule(L.LightningModule):
                     compiler_works = False
             return plain(*args)
 
-        model.compute = compute
-        try:
-            yield
-        finally:
-            del model.compute  # leaves the method of the class
+        return compute
 
     def loss(self, samples: Samples) -> Tensor:
         """Return the mean penalty of the normalised accelerations, plus the weighted error of the normalised stress if the model decodes one.
@@ -179,6 +198,8 @@ class TrainingModule(L.LightningModule):
         that the unrolls have reached, and the predictions advance these unrolls by one step. For unrolls with gradients, the loss is the mean over their steps.
         Its errors are those of positions after each step, in units of the acceleration scale times the squared frame interval.
         """
+        if self._graphs is not None:
+            self._graphs.begin_step()
         if isinstance(samples, list) and isinstance(samples[0], Unroll):
             unrolls = [sample for sample in samples if isinstance(sample, Unroll)]
             return self._mean_loss(predictions(self.simulator, unrolls), unrolls[0].num_steps)

@@ -31,7 +31,7 @@ from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAvera
 from gpe_pl.training.checkpoints import AtomicCheckpoints, Checkpoints
 from gpe_pl.training.interruption import Interruption
 from gpe_pl.training.loss_terms import Loss, StressLoss
-from gpe_pl.training.module import Compile, Schedule, TrainingError, TrainingModule
+from gpe_pl.training.module import Compile, CudaGraph, Schedule, TrainingError, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 
 KNOWN_WARNINGS = (
@@ -97,6 +97,7 @@ class TrainingSettings:
     neighbor_weight: Annotated[float, Field(gt=0, le=10)] | None = None
     early_layers: Annotated[int, Field(ge=0)] | None = None
     compile: Compile = "auto"
+    cuda_graph: CudaGraph = "auto"
     val_interval: Annotated[int, Field(ge=1)] = 1000
     num_val_rollouts: Annotated[int, Field(ge=1)] = 4
     val_rollout_steps: Annotated[int, Field(ge=1)] = 100

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from gpe_pl.fit import fit
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.models.gpe import GPE
+from gpe_pl.models.lookup import model_class
 from gpe_pl.rollout.loop import steps
 from gpe_pl.training.module import TrainingModule
+from gpe_pl.training.optimizer import clip
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests.runs import compose
 
@@ -32,11 +34,11 @@ def trajectory(request: pytest.FixtureRequest) -> Trajectory:
     return generate_trajectory(dataset(f"data={request.param}", "size=tiny"), "train", 0, num_frames=25)
 
 
-def module(trajectory: Trajectory, name: str) -> tuple[TrainingModule, WindowDataset]:
-    cfg = compose("fit", "size=tiny", "model=gpe_tuned", f"data={name}")
+def module(trajectory: Trajectory, name: str, model_name: str = "gpe_tuned", **settings: Any) -> tuple[TrainingModule, WindowDataset]:
+    cfg = compose("fit", "size=tiny", f"model={model_name}", f"data={name}")
     builder = GraphBuilder(GraphConfig(**cfg.graph), trajectory.metadata)
     torch.manual_seed(0)
-    model = GPE(builder.spec, **{key: value for key, value in cfg.model.items() if key != "_target_"})
+    model = model_class(cfg.model["_target_"])(builder.spec, **{key: value for key, value in cfg.model.items() if key != "_target_"})
     for parameter in model.parameters():
         if not parameter.any():  # decoders begin at zero
             torch.nn.init.normal_(parameter, std=0.02)
@@ -45,7 +47,7 @@ def module(trajectory: Trajectory, name: str) -> tuple[TrainingModule, WindowDat
     windows = WindowDataset([stored], builder, Noise(0.0, 0.0, 0.0), 1.0, 0, bool(cfg.model.get("stress")))
     windows.probability = np.full(len(windows), 1 / len(windows))  # so graphs have weights
     simulator.fit_statistics([windows[k] for k in WINDOWS])
-    return TrainingModule(simulator, 100, compile="off"), windows
+    return TrainingModule(simulator, 100, compile="off", **settings), windows
 
 
 @pytest.mark.parametrize("unrolls", [False, True])
@@ -61,6 +63,32 @@ def test_losses_and_gradients_are_the_same(trajectory: Trajectory, unrolls: bool
         found[device] = float(loss.detach()), gradient
     assert found["cuda"][0] == pytest.approx(found["cpu"][0], rel=1e-3)
     assert (found["cuda"][1] - found["cpu"][1]).norm() <= 1e-2 * found["cpu"][1].norm()
+
+
+@pytest.mark.parametrize("model_name", ["gpe_tuned", "gpe", "gns", "dpinet", "cconv"])
+def test_cuda_graphs_train_as_single_operations(trajectory: Trajectory, model_name: str) -> None:
+    found = {}
+    for cuda_graph in ("off", "auto"):
+        trained, windows = module(trajectory, trajectory.metadata.dataset, model_name, cuda_graph=cuda_graph)
+        optimizer, losses, gradients = torch.optim.SGD(trained.to("cuda").parameters(), lr=1e-3), [], []
+        with trained.compiled():
+            for step in range(10):
+                keys = [WINDOWS[step % 4], WINDOWS[(step + 1 + step // 4) % 4]][: 1 + step % 2]
+                samples = trained.transfer_batch_to_device(collated([windows[key] for key in keys]), torch.device("cuda"), 0)
+                optimizer.zero_grad()
+                loss = trained.loss(samples)
+                loss.backward()
+                gradients.append(torch.cat([p.grad.flatten().cpu() for p in trained.parameters() if p.grad is not None]))
+                clip(trained.parameters(), 1.0)
+                optimizer.step()
+                losses.append(float(loss.detach()))
+            graphs = trained._graphs
+            assert (graphs is not None) == (cuda_graph == "auto")
+            assert graphs is None or (graphs.works and 1 <= graphs.num_made < 8)
+        found[cuda_graph] = losses, gradients
+    assert found["auto"][0] == pytest.approx(found["off"][0], rel=1e-3)
+    for ours, theirs in zip(found["auto"][1], found["off"][1], strict=True):
+        assert (ours - theirs).norm() <= 1e-2 * theirs.norm()
 
 
 def test_rollouts_are_the_same(trajectory: Trajectory) -> None:
