@@ -33,6 +33,10 @@ Sizes = dict[str | EdgeType, int]
 MULTIPLE = 64
 """Sizes of arrays are multiples of this number."""
 
+MOST_ROWS = 100_000
+"""Number of nodes and edges of a batch beyond which there are no graphs. The GPU then computes longer than the host needs to start the operations (see
+``docs/results/scaling_gpu``), and further rows would cost time."""
+
 MARGIN = 1.125
 """Size of an array relative to the batch for which it was made. Later batches then fit more often."""
 
@@ -170,10 +174,11 @@ class CudaGraphs:
     def __call__(self, *arguments: Any) -> Any:
         usable = self.works and self._is_free and self.model.training and torch.is_grad_enabled()
         leaves = pytree.tree_leaves(arguments) if usable else []
-        if not leaves or any(leaf.requires_grad for leaf in leaves) or not all(sizes_of(arguments).values()):
+        sizes = sizes_of(arguments) if leaves else {}
+        if not all(sizes.values()) or not 0 < sum(sizes.values()) <= MOST_ROWS or any(leaf.requires_grad for leaf in leaves):
             return self.compute(*arguments)
         try:
-            filled, graph = self._graph(arguments)
+            filled, graph = self._graph(arguments, sizes)
         except Exception as error:  # depends on the operations of the model
             log.warning("training.cuda_graph: auto continues without CUDA graphs, which fail here (%s)", reason(error))
             self.works = False
@@ -182,11 +187,10 @@ class CudaGraphs:
         self._is_free = False
         filled.fill(arguments)
         results = graph(*self.model.parameters(), *pytree.tree_leaves(filled.arguments))
-        return without_further_nodes(results, sizes_of(arguments))
+        return without_further_nodes(results, sizes)
 
-    def _graph(self, arguments: tuple[dict[Any, Any], ...]) -> tuple[FilledArguments, Callable[..., Any]]:
-        """Return arrays in which the arguments fit, and the graph that works on them."""
-        sizes = sizes_of(arguments)
+    def _graph(self, arguments: tuple[dict[Any, Any], ...], sizes: Sizes) -> tuple[FilledArguments, Callable[..., Any]]:
+        """Return arrays in which arguments of the given sizes fit, and the graph that works on them."""
         key = tuple(map(tuple, arguments)), round(2 * math.log2(sum(sizes.values())))
         weights = [p.data_ptr() for p in self.model.parameters()]
         before, graph, of_weights = self._graphs.get(key, (None, None, []))

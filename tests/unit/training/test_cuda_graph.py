@@ -177,6 +177,12 @@ def test_only_the_first_call_of_a_step_uses_a_graph(graphs: CudaGraphs, monkeypa
     assert len(calls) == 1
 
 
+def test_large_batches_have_no_graph(graphs: CudaGraphs, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gpe_pl.training.cuda_graph.MOST_ROWS", 100)
+    graphs.model(particles())
+    assert not graphs.num_made
+
+
 def test_moved_weights_need_a_new_graph(graphs: CudaGraphs) -> None:
     graphs.model(particles())
     weight = next(graphs.model.parameters())
