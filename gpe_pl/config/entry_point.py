@@ -54,6 +54,7 @@ OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # ${run_nam
 OmegaConf.register_new_resolver("sweep_name", sweep_name, replace=True)
 OmegaConf.register_new_resolver("fine_suffix", lambda fine: "" if fine == 1 else f"_fine{fine}", replace=True)  # of names of data sets
 OmegaConf.register_new_resolver("spacing_suffix", spacing_suffix, replace=True)
+OmegaConf.register_new_resolver("stress_suffix", lambda stress: "_stress" if stress is True else "", replace=True)
 
 T = TypeVar("T")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, field
+from dataclasses import asdict, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Protocol, cast, runtime_checkable
 
@@ -25,7 +25,7 @@ from gpe_pl.schema import MATERIALS, SPLITS, MaterialParameter, MaterialValues, 
 from gpe_pl.solvers.finer_solver import TRACERS, FinerSolver, Refinable
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.solvers.scenes import SceneDistribution, describe
-from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 MOST = 1_000_000
@@ -60,7 +60,9 @@ class Solver(Simulator, Protocol):
 
     name: ClassVar[str]
     version: ClassVar[str]
-    stores_stress: ClassVar[bool]
+
+    @property
+    def stores_stress(self) -> bool: ...
 
     @property
     def frame_dt(self) -> float: ...
@@ -264,7 +266,10 @@ class DatasetSpec:
 
 
 def _settings(solver: Any, named: Solver) -> dict[str, Any]:
-    return {**asdict(solver), "name": named.name, "version": named.version, "solver_dt": solver.solver_dt}
+    settings = asdict(solver)
+    if settings.get("stress") is False:  # as in the specification of a data set without the stress of particles
+        del settings["stress"]
+    return {**settings, "name": named.name, "version": named.version, "solver_dt": solver.solver_dt}
 
 
 def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
@@ -330,6 +335,7 @@ def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
         solver=spec.solver.name,
         solver_version=spec.solver.version,
         config=json.dumps(spec.provenance, sort_keys=True),
+        stress_materials=tuple(spec.scene.materials) if spec.solver.stores_stress and "solid" not in spec.scene.materials else None,
     )
 
 
@@ -347,7 +353,10 @@ def initial_state(spec: DatasetSpec, split: str, index: int, values: Mapping[str
     """
     seed = scene_seed(spec, split, index)
     try:
-        return spec.scene.sample(named_values(spec, values) if values else parameter_values(spec, split, index)[0], seed)
+        state = spec.scene.sample(named_values(spec, values) if values else parameter_values(spec, split, index)[0], seed)
+        if spec.solver.stores_stress and state.stress is None:
+            state = replace(state, stress=Stress.of_nodes(np.zeros((state.num_nodes, 4 if state.dim == 2 else 6)), state.cells))
+        return state
     except ValueError as error:
         raise GenerationError(f"split {split}, index {index}, seed {seed}: {error}", split, index, seed) from None
 

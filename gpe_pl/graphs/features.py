@@ -173,7 +173,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     stress_channels = dict.fromkeys(metadata.with_stress, 4 if dim == 2 else 6)
     if config.stress and (not stress_channels or config.scales != "one"):
         raise GraphError(
-            f"graph.stress=true: the data set stores no stress of {', '.join(materials)}; set graph.stress=false"
+            f"graph.stress=true: the data set stores no stress of {', '.join(materials)}; set graph.stress=false, or data.solver.stress=true for MPM"
             if not stress_channels
             else f"graph.scales={config.scales}: not with graph.stress=true; set one of them to its default"
         )

@@ -245,7 +245,7 @@ class GPE(Model):
             )
         if stress and not spec.stress_channels:
             raise StressError(
-                f"model.stress=true, but the data set stores no stress of {', '.join(spec.materials)}; choose model.stress=false or data=fem"
+                f"model.stress=true: the data set stores no stress of {', '.join(spec.materials)}; set model.stress=false or, for MPM, data.solver.stress=true"
             )
         self.interaction, self.decoder, self.edge_state = interaction, decoder, edge_state
         self._program: GPEProgramRunner | None = None

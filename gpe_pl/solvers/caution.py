@@ -34,7 +34,7 @@ def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], scenes: I
                 f"{name} = {', '.join(f'{value:g}' for value in values)} {unit} is below {smallest:.3g} {unit}, which the grid of the solver {solver.name} "
                 "adds, so such trajectories differ little; choose a smaller grid_spacing, or leave these values out"
             )
-    if solver.stores_stress:
+    if getattr(solver, "has_mesh", False):
         fractions = [float(np.mean(thin_nodes(np.asarray(s.cells), s.num_nodes, s.dim))) for s in scenes if s.cells is not None]
         thin = [fraction for fraction in fractions if fraction > THIN_FRACTION]
         if thin:

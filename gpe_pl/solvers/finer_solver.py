@@ -67,6 +67,10 @@ class FinerSolver:
         return self.solver.stores_stress
 
     @property
+    def has_mesh(self) -> bool:
+        return self.solver.has_mesh
+
+    @property
     def frame_dt(self) -> float:
         return self.solver.frame_dt
 
@@ -105,7 +109,9 @@ class FinerSolver:
             node = -1 if error.node < 0 else int(fine.origin[[error.node]].argmax())
             raise SimulationError(f"in the solution at 1/{self.factor} of the spacing: {error}", reason=error.reason, node=node) from None
         nodes = slice(state.num_nodes)
-        stress = None if after.stress is None else _averaged(after.stress.cell, state)
+        stress = None
+        if after.stress is not None:
+            stress = _averaged(after.stress.cell, state) if self.solver.has_mesh else Stress.of_nodes(after.stress.node[nodes], state.cells)
         return state.later(
             self.frame_dt, after.pos[nodes], after.vel[nodes], velocity_history=None, stress=stress, num_substeps=after.num_substeps,
             internal=Divided(after, fine.origin),

@@ -13,6 +13,7 @@ from array_api_compat import array_namespace, device
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.trajectory.arrays import ArrayError
 from gpe_pl.trajectory.boundary import Array, Boundary
+from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.kinds import CELL, GROUP, NODE, PARTS, SCENE, STEP, names_of
 from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.openings import Opening
@@ -20,17 +21,25 @@ from gpe_pl.trajectory.openings import Opening
 
 @dataclass(frozen=True)
 class Stress:
-    """Cauchy stress of a mesh in Pa. In a ``Trajectory`` the arrays have a leading axis of frames.
+    """Cauchy stress in Pa. In a ``Trajectory`` the arrays have a leading axis of frames.
 
     Components are xx, xy, yy, zz in plane strain and xx, xy, xz, yy, yz, zz in 3D.
 
     Attributes:
-        node: stress at nodes [node, component], the mean over the cells around each node; zero at nodes without a cell.
+        node: stress at nodes [node, component]. Where the solver computes it in cells, it is the mean over the cells around each node, and zero at nodes
+            without a cell.
         cell: stress in cells [cell, component].
     """
 
     node: Array
     cell: Array
+
+    @classmethod
+    def of_nodes(cls, node: np.ndarray, cells: Array | None) -> Stress:
+        """Return a stress that is known at nodes. Stresses of cells are means over their corners."""
+        if cells is None or not len(cells):
+            return cls(node, np.zeros((0, node.shape[1])))
+        return cls(node, mean_over_corners(node, np.asarray(cells)))
 
     @property
     def node_von_mises(self) -> Array:

@@ -21,7 +21,7 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 MATERIAL_COLORS = {"sand": "#E69F00", "snow": "#56B4E9", "fluid": "#0072B2", "elastomer": "#D55E00", "solid": "#009E73"}
 
 REFERENCE = "#7A8B99"
-"""Colour of items without a value: ground-truth particles under ``error``, particles outside meshes under ``von_mises``, and moving walls."""
+"""Colour of items without a value: ground-truth particles under ``error``, particles without a stress under ``von_mises``, and moving walls."""
 
 ColorBy = Literal["error", "height", "material", "speed", "von_mises"]
 
@@ -53,7 +53,7 @@ class Coloring:
 
     Args:
         by: quantity. ``error`` is the distance from ``truth``; ``height`` is the height in its first frame, which makes mixing visible; ``material``,
-            ``speed`` and ``von_mises`` (of a mesh) are named after their quantities.
+            ``speed`` and ``von_mises`` are named after their quantities.
         trajectories: all trajectories in the figure.
         frames: the frames in the figure.
         truth: ground truth, for ``error``.
@@ -66,7 +66,7 @@ class Coloring:
         if by == "error" and truth is None:
             raise ValueError("colour by error needs the ground truth")
         if by == "von_mises" and all(t.stress is None for t in trajectories):
-            raise ValueError("colour by von_mises needs a mesh with stress, which no trajectory has")
+            raise ValueError("colour by von_mises needs a stress, which no trajectory has")
         self.by, self._truth = by, truth
         self.color_map: Colormap = COLOR_MAPS[by].with_extremes(bad=REFERENCE)
         self.scale: Normalize = self._scale(trajectories, list(frames))
@@ -76,8 +76,8 @@ class Coloring:
             return Normalize(-0.5, len(MATERIALS) - 0.5)
         if self.by == "height":
             frames = [0]
-        part = 1 if self.by == "von_mises" else 0  # cells or nodes
-        shown = [self.values(t, f)[part] for t in trajectories for f in frames if f < t.num_frames]
+        pairs = (self.values(t, f) for t in trajectories for f in frames if f < t.num_frames)
+        shown = [cells if self.by == "von_mises" and len(cells) else nodes for nodes, cells in pairs]
         values = np.concatenate([np.empty(0), *shown])
         values = values[np.isfinite(values)]
         if self.by == "height":
@@ -100,8 +100,10 @@ class Coloring:
         if self.by == "von_mises":
             if trajectory.stress is None:
                 return unknown, np.full(len(cells), np.nan)
-            in_mesh = np.isin(np.arange(trajectory.num_nodes), cells)
-            nodes = np.where(in_mesh, von_mises(trajectory.stress.node[frame]), np.nan)
+            known = np.isin(np.arange(trajectory.num_nodes), cells)
+            particles = np.setdiff1d([node_code(m) for m in trajectory.metadata.with_stress], trajectory.node_type[known])
+            known |= np.isin(trajectory.node_type, particles)
+            nodes = np.where(known, von_mises(trajectory.stress.node[frame]), np.nan)
             return nodes, von_mises(trajectory.stress.cell[frame]).astype(float)
         if self.by == "height":
             first = 0 if trajectory.alive is None else trajectory.alive.argmax(axis=0)  # the frame in which a node enters

@@ -19,9 +19,10 @@ from gpe_pl.solvers.mpm.collider import Collider, collider
 from gpe_pl.solvers.mpm.frame import ESCAPE, NOT_FINITE, OK, advance
 from gpe_pl.solvers.mpm.particles import Particles
 from gpe_pl.solvers.mpm.restart import gradients
+from gpe_pl.solvers.mpm.stress import cauchy_stress
 from gpe_pl.solvers.supported import check_surroundings
 from gpe_pl.trajectory.boundary import Boundary
-from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.state import State, Stress
 
 PADDING = 3
 """Number of cells between the domain and the edge of the grid, for the kernel of a particle up to one cell behind a wall."""
@@ -85,6 +86,7 @@ class MPM:
             Parameters with a column in ``State.material_params`` have the values there.
         cfl: fraction of a cell that a wave or a particle may cross in one substep.
         max_substeps: largest number of substeps per frame. If a frame needs more, the step fails as an explosion.
+        stress: states that ``step`` returns have the Cauchy stress of the particles; see ``mpm.stress``.
     """
 
     bounds: tuple[tuple[float, float], ...]
@@ -97,10 +99,10 @@ class MPM:
     fluid: Fluid | None = None
     cfl: Annotated[float, Field(gt=0, le=1)] = 0.5
     max_substeps: Annotated[int, Field(ge=1)] = 1000
+    stress: bool = False
 
     name: ClassVar[str] = "mpm"
     version: ClassVar[str] = "6"
-    stores_stress: ClassVar[bool] = False
     has_mesh: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -108,6 +110,11 @@ class MPM:
         unknown = [m for m in self.materials if m not in KNOWN]
         if unknown or not self.materials:
             raise ValueError(f"MPM has no law for material {', '.join(unknown) or '(none)'}; known: {', '.join(KNOWN)}")
+
+    @property
+    def stores_stress(self) -> bool:
+        """Whether states that ``step`` returns have a stress."""
+        return self.stress
 
     @property
     def solver_dt(self) -> float:
@@ -172,7 +179,10 @@ class MPM:
         if status != OK:
             raise self._error(status, node, particles.pos, particles.vel, state.gravity)
         internal = MPMInternal(particles.deformation, particles.affine, particles.gradient, particles.plastic, np.array(last_substep))
-        return state.later(self.frame_dt, particles.pos, particles.vel, velocity_history=None, num_substeps=num_substeps, internal=internal)
+        stress = Stress.of_nodes(cauchy_stress(particles, float(last_substep)), state.cells) if self.stress else None
+        return state.later(
+            self.frame_dt, particles.pos, particles.vel, velocity_history=None, num_substeps=num_substeps, internal=internal, stress=stress
+        )
 
     def finer(self, factor: int) -> MPM:
         """Return the solver with ``1 / factor`` of the grid spacing, and ``factor`` times as many substeps allowed; see ``solvers.finer_solver``."""

@@ -5,6 +5,7 @@ import pytest
 from matplotlib.colors import to_rgba
 
 from gpe_pl.schema import node_code
+from gpe_pl.trajectory.state import Stress, von_mises
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, Coloring
 
 
@@ -50,6 +51,17 @@ def test_what_has_no_stress_is_neutral(mesh):
         np.testing.assert_allclose(colors, np.tile(to_rgba(REFERENCE), (len(colors), 1)))
 
 
+def test_particles_with_a_stress_are_coloured(ground_truth):
+    node = np.random.default_rng(0).normal(size=(ground_truth.num_frames, ground_truth.num_nodes, 4))
+    with_stress = replace(ground_truth.metadata, stress_materials=ground_truth.metadata.materials)
+    particles = replace(ground_truth, metadata=with_stress, stress=Stress(node, np.zeros((len(node), 0, 4))))
+    coloring = Coloring("von_mises", [particles], range(particles.num_frames))
+    np.testing.assert_allclose(coloring.values(particles, 2)[0], von_mises(node[2]))
+    assert 0.5 < coloring.scale.vmax / von_mises(node).max() <= 1
+    bare = replace(particles, metadata=replace(with_stress, stress_materials=()))
+    assert np.isnan(coloring.values(bare, 2)[0]).all()
+
+
 def test_cells_have_the_mean_of_their_corners(mesh):
     moved = replace(mesh, pos=mesh.pos + 0.01 * np.arange(mesh.num_nodes)[:, None])
     nodes, cells = Coloring("error", [mesh, moved], [0], mesh).values(moved, 0)
@@ -70,7 +82,7 @@ def test_equal_trajectories_still_have_a_scale(ground_truth, mesh):
 
 
 def test_colours_without_data_are_refused(ground_truth):
-    with pytest.raises(ValueError, match="von_mises needs a mesh"):
+    with pytest.raises(ValueError, match="von_mises needs a stress"):
         Coloring("von_mises", [ground_truth], [0])
     with pytest.raises(ValueError, match="ground truth"):
         Coloring("error", [ground_truth], [0])
