@@ -82,7 +82,7 @@ class State:
         rest_pos: undeformed positions [node, dim] in m; None without a mesh. Nodes without a cell have their initial position.
         cells: nodes of each mesh cell [cell, corner]; a cell with fewer corners than others repeats its last corner.
         cell_dim: dimension of the cells, 2 for surfaces in 3D; None stands for the dimension of space. See ``cells.kinds_of``.
-        stress: stress of the mesh; None if the simulator does not compute it.
+        stress: stress of the mesh or of particles; None if the simulator does not compute it.
         num_substeps: number of solver substeps in the last frame.
         num_corrected: number of nodes that containment put back in the last frame.
         num_asleep: number of sleeping nodes, which the simulator did not compute in the last frame.

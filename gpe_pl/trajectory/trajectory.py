@@ -205,7 +205,7 @@ class Trajectory:
         material_params: as in ``State`` [node, param].
         boundary: boundary in the first frame; if it moves, its motion has as many frames as the trajectory.
         rest_pos, cells, cell_dim: reference configuration of meshes, as in ``State``.
-        stress: stress of the mesh in every frame.
+        stress: stress in every frame.
         rigid_body: number of the rigid body of each node, as in ``State``.
         alive: mask [frame, node] of the nodes that are in an open scene; None if all are in it in every frame. A node enters and leaves at most once, so its
             number is its identity. Before and after, its position and velocity are those of the nearest frame in which it is in the scene.

@@ -86,7 +86,8 @@ class MPM:
             Parameters with a column in ``State.material_params`` have the values there.
         cfl: fraction of a cell that a wave or a particle may cross in one substep.
         max_substeps: largest number of substeps per frame. If a frame needs more, the step fails as an explosion.
-        stress: states that ``step`` returns have the Cauchy stress of the particles; see ``mpm.stress``.
+        stress: states that ``step`` returns have the Cauchy stress of the particles; see ``mpm.stress``. Not in open scenes. ``rollout`` keeps it if the first
+            state has one, too; that of undeformed particles is zero.
     """
 
     bounds: tuple[tuple[float, float], ...]
@@ -157,6 +158,8 @@ class MPM:
                 ``escape`` (a particle left the domain through an open side or started outside) or ``explosion`` (more than ``max_substeps``).
         """
         check_surroundings(state, "MPM", computes_open_scenes=True)
+        if self.stress and state.openings:
+            raise SimulationError("MPM stores no stress in scenes with inlets and outlets; set stress=false", reason="input")
         internal = state.internal if state.internal is not None else MPMInternal.at_rest(state.num_nodes, len(self.bounds))
         particles = self._particles(state, internal)
         if state.internal is None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from gpe_pl.geometry.shapes import domain_walls
-from gpe_pl.rollout.loop import rollout, steps
+from gpe_pl.rollout.loop import SimulationError, rollout, steps
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.mpm.solver import MPMInternal
@@ -49,6 +50,11 @@ def test_sand_that_entered_less_sand_that_left_is_there() -> None:
     assert (change == -1).sum() > 20
     np.testing.assert_array_equal(result.alive[1:].sum(axis=1), 16 + np.cumsum(change.sum(axis=1)))
     assert (result.pos[result.alive][:, 1] > 0.5).all()
+
+
+def test_stress_in_open_scenes_is_refused() -> None:
+    with pytest.raises(SimulationError, match="no stress in scenes with inlets"):
+        MPM(bounds=BOUNDS, grid_spacing=SPACING, materials=("sand",), frame_dt=DT, stress=True).step(tap(TAP))
 
 
 def test_internal_state_follows_its_particles() -> None:
