@@ -82,8 +82,8 @@ class TrainingModule(L.LightningModule):
         stress_weight: weight of the mean squared error of the normalised stress, relative to that of the acceleration; used if the model decodes a stress.
         neighbor_weight: c in the weight exp(−c n/n̄) of the acceleration of a node with n neighbours; see ``loss_terms.num_neighbors``. None weights all alike.
         mean_neighbors: n̄, the mean number of neighbours of a node in the training data.
-        compile: whether to apply ``torch.compile`` to the model. ``auto`` compiles if the run is long enough, the model has no fused passes for the device
-            (``is_fused``, on a CPU) and a C++ compiler is found.
+        compile: whether to apply ``torch.compile`` to the model. ``auto`` compiles if the run is long enough, the model has neither CUDA graphs nor fused passes
+            for the device (``is_fused``, on a CPU), and a C++ compiler is found.
         cuda_graph: whether training steps use CUDA graphs of the model. ``auto`` does so on a GPU in runs of one process; see ``training.cuda_graph``.
     """
 
@@ -150,7 +150,7 @@ class TrainingModule(L.LightningModule):
         plain = compute = model.compute
         if self._wants_compilation():
             compute = self._compiled(plain)
-        if self.cuda_graph == "auto" and self.device.type == "cuda" and ranks.num_ranks() == 1:
+        if self._wants_graphs():
             compute = self._graphs = CudaGraphs(model, compute)
         if compute is plain:
             yield
@@ -162,10 +162,13 @@ class TrainingModule(L.LightningModule):
             self._graphs = None
             del model.compute  # leaves the method of the class
 
+    def _wants_graphs(self) -> bool:
+        return self.cuda_graph == "auto" and self.device.type == "cuda" and ranks.num_ranks() == 1
+
     def _wants_compilation(self) -> bool:
         """Tell whether ``compile`` asks for ``torch.compile``, and it works here."""
         is_long = self.num_steps - self.global_step >= COMPILE_PAYS_AFTER
-        is_fast_already = self.device.type == "cpu" and self.simulator.model.is_fused
+        is_fast_already = self._wants_graphs() or (self.device.type == "cpu" and self.simulator.model.is_fused)
         wanted = self.compile_mode == "on" or (self.compile_mode == "auto" and is_long and not is_fast_already)
         if wanted and self.compile_mode == "auto" and not has_cpp_compiler():
             log.warning("compile: auto found no C++ compiler; training runs without torch.compile")

@@ -47,7 +47,7 @@ def module(trajectory: Trajectory, name: str, model_name: str = "gpe_tuned", **s
     windows = WindowDataset([stored], builder, Noise(0.0, 0.0, 0.0), 1.0, 0, bool(cfg.model.get("stress")))
     windows.probability = np.full(len(windows), 1 / len(windows))  # so graphs have weights
     simulator.fit_statistics([windows[k] for k in WINDOWS])
-    return TrainingModule(simulator, 100, compile="off", **settings), windows
+    return TrainingModule(simulator, 100, **{"compile": "off", **settings}), windows
 
 
 @pytest.mark.parametrize("unrolls", [False, True])
@@ -65,11 +65,13 @@ def test_losses_and_gradients_are_the_same(trajectory: Trajectory, unrolls: bool
     assert (found["cuda"][1] - found["cpu"][1]).norm() <= 1e-2 * found["cpu"][1].norm()
 
 
+@pytest.mark.parametrize("compile", ["off", pytest.param("on", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("model_name", ["gpe_tuned", "gpe", "gns", "dpinet", "cconv"])
-def test_cuda_graphs_train_as_single_operations(trajectory: Trajectory, model_name: str) -> None:
+def test_cuda_graphs_train_as_single_operations(trajectory: Trajectory, model_name: str, compile: str) -> None:
     found = {}
     for cuda_graph in ("off", "auto"):
-        trained, windows = module(trajectory, trajectory.metadata.dataset, model_name, cuda_graph=cuda_graph)
+        how = {"cuda_graph": cuda_graph, "compile": compile if cuda_graph == "auto" else "off"}
+        trained, windows = module(trajectory, trajectory.metadata.dataset, model_name, **how)
         optimizer, losses, gradients = torch.optim.SGD(trained.to("cuda").parameters(), lr=1e-3), [], []
         with trained.compiled():
             for step in range(10):

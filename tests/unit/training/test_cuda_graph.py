@@ -224,3 +224,13 @@ def test_a_cpu_uses_no_graphs() -> None:
     module = TrainingModule(LearnedSimulator(GPE(build.spec, hidden_channels=8), build), 10)
     with module.compiled():
         assert "compute" not in module.simulator.model.__dict__
+
+
+@pytest.mark.parametrize(("compile", "cuda_graph", "wanted"), [("auto", "auto", False), ("auto", "off", True), ("on", "auto", True)])
+def test_long_runs_with_graphs_compile_only_if_asked(compile: Any, cuda_graph: Any, wanted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    build = scenes.builder(MATERIALS, history=1)
+    simulator = LearnedSimulator(GPE(build.spec, hidden_channels=8), build)
+    module = TrainingModule(simulator, 20_000, compile=compile, cuda_graph=cuda_graph)
+    monkeypatch.setattr(TrainingModule, "device", torch.device("cuda"))
+    monkeypatch.setattr("gpe_pl.training.module.has_cpp_compiler", lambda: True)
+    assert module._wants_compilation() == wanted
