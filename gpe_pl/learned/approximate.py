@@ -177,11 +177,11 @@ def _in_the_same_island(chosen: np.ndarray, label: np.ndarray) -> np.ndarray:
 
 
 def _combined_stress(state: State, after: State, awake: Tensor, moved: Tensor) -> Stress | None:
-    if after.stress is None or state.cells is None:
+    if after.stress is None:
         return state.stress if not bool(awake.any()) else None
     node = after.stress.node.new_zeros(state.num_nodes, after.stress.node.shape[1]) if state.stress is None else state.stress.node.clone()
     node[awake] = after.stress.node[moved]
-    return Stress(node, mean_over_corners(node, state.cells))
+    return Stress(node, node.new_empty(0, node.shape[1]) if state.cells is None else mean_over_corners(node, state.cells))
 
 
 @dataclass(frozen=True)

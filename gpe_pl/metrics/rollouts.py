@@ -309,7 +309,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     final_mse              m²     squared position error in frame h, mean over nodes and dimensions
     displacement_error     1      ‖x − x̂‖ / ‖x̂ − x̂(0)‖ with x̂ the ground truth, norms over frames, nodes and dimensions
     velocity_error         1      ‖v − v̂‖ / ‖v̂‖, norms as above
-    von_mises_error        1      root mean square error of the von Mises stress at mesh nodes over frames 1 … h, over the root mean square in all
+    von_mises_error        1      root mean square error of the von Mises stress at nodes over frames 1 … h, over the root mean square in all
                                   frames of the ground truth; only if both trajectories have a stress
     stress_error           1      the same for the Cauchy stress tensor
     energy_distance        m      between the clouds of frame h, per material, averaged by mass

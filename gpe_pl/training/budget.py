@@ -64,6 +64,8 @@ def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: T
         "matmul_precision": trainer.matmul_precision,
         "data_sha256": data,
     }
+    if trainer.device != "cpu":
+        parts["cuda_graph"] = training.cuda_graph
     if training.unroll_steps is not None:
         parts["unroll_steps"] = training.unroll_steps
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:8]

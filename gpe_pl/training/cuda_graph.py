@@ -37,6 +37,9 @@ MOST_ROWS = 100_000
 """Number of nodes and edges of a batch beyond which there are no graphs. The GPU then computes longer than the host needs to start the operations (see
 ``docs/results/scaling_gpu``), and further rows would cost time."""
 
+MOST_EDGES = 16
+"""Largest number of further edges of a relation per further node. With many more edges than usual, states of models without normalisation could overflow."""
+
 MARGIN = 1.125
 """Size of an array relative to the batch for which it was made. Later batches then fit more often."""
 
@@ -51,13 +54,21 @@ def sizes_of(arguments: tuple[dict[Any, Any], ...]) -> Sizes:
 
 
 def enlarged(needed: Sizes, before: Sizes) -> Sizes:
-    """Return sizes of arrays in which a batch fits with at least one further node of each type, and with some margin where ``before`` does not suffice."""
+    """Return sizes of arrays in which a batch fits, with some margin where ``before`` does not suffice.
 
-    def size(key: str | EdgeType) -> int:
-        rows = needed[key] + isinstance(key, str)
+    Node types have enough further nodes for the further edges of each relation, and at least one.
+    """
+
+    def size(key: str | EdgeType, rows: int) -> int:
         return before[key] if before.get(key, 0) >= rows else MULTIPLE * math.ceil(MARGIN * rows / MULTIPLE)
 
-    return {key: size(key) for key in needed}
+    found: Sizes = {key: size(key, count) for key, count in needed.items() if isinstance(key, tuple)}
+    further = {key: 1 for key in needed if isinstance(key, str)}
+    for key, rows in found.items():
+        ends = {key[0], key[2]} if isinstance(key, tuple) else set()
+        for end in ends & further.keys():
+            further[end] = max(further[end], math.ceil((rows - needed[key]) / MOST_EDGES))
+    return found | {key: size(key, needed[key] + count) for key, count in further.items()}
 
 
 class FilledArguments:
@@ -171,6 +182,13 @@ class CudaGraphs:
         """Tell that the gradients of all earlier calls have been computed or are not needed."""
         self._is_free = True
 
+    def clear(self) -> None:
+        """Free the memory of all graphs."""
+        self._graphs.clear()
+        self._memory = None
+        gc.collect()
+        torch.cuda.empty_cache()
+
     def __call__(self, *arguments: Any) -> Any:
         usable = self.works and self._is_free and self.model.training and torch.is_grad_enabled()
         leaves = pytree.tree_leaves(arguments) if usable else []
@@ -182,7 +200,7 @@ class CudaGraphs:
         except Exception as error:  # depends on the operations of the model
             log.warning("training.cuda_graph: auto continues without CUDA graphs, which fail here (%s)", reason(error))
             self.works = False
-            self._graphs.clear()
+            self.clear()
             return self.compute(*arguments)
         self._is_free = False
         filled.fill(arguments)
@@ -198,6 +216,7 @@ class CudaGraphs:
         if before and graph and before.sizes == needed and weights == of_weights:
             return before, graph
         self._graphs.pop(key, None)
+        before = graph = None  # so that its memory is free before a larger graph is made
         filled = FilledArguments(arguments, needed)
         filled.fill(arguments)
         graph = self._made(filled)

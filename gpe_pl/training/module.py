@@ -82,8 +82,8 @@ class TrainingModule(L.LightningModule):
         stress_weight: weight of the mean squared error of the normalised stress, relative to that of the acceleration; used if the model decodes a stress.
         neighbor_weight: c in the weight exp(−c n/n̄) of the acceleration of a node with n neighbours; see ``loss_terms.num_neighbors``. None weights all alike.
         mean_neighbors: n̄, the mean number of neighbours of a node in the training data.
-        compile: whether to apply ``torch.compile`` to the model. ``auto`` compiles if the run is long enough, the model has neither CUDA graphs nor fused passes
-            for the device (``is_fused``, on a CPU), and a C++ compiler is found.
+        compile: whether to apply ``torch.compile`` to the model. ``auto`` compiles if the run is long enough, the model has neither CUDA graphs nor fused
+            passes for the device (``is_fused``, on a CPU), and a C++ compiler is found.
         cuda_graph: whether training steps use CUDA graphs of the model. ``auto`` does so on a GPU in runs of one process; see ``training.cuda_graph``.
     """
 
@@ -159,7 +159,9 @@ class TrainingModule(L.LightningModule):
         try:
             yield
         finally:
-            self._graphs = None
+            if self._graphs is not None:
+                self._graphs.clear()
+                self._graphs = None
             del model.compute  # leaves the method of the class
 
     def _wants_graphs(self) -> bool:

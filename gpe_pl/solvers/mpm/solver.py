@@ -100,7 +100,7 @@ class MPM:
     fluid: Fluid | None = None
     cfl: Annotated[float, Field(gt=0, le=1)] = 0.5
     max_substeps: Annotated[int, Field(ge=1)] = 1000
-    stress: bool = False
+    stress: Annotated[bool, Field(strict=True)] = False
 
     name: ClassVar[str] = "mpm"
     version: ClassVar[str] = "6"

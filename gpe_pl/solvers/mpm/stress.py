@@ -22,7 +22,7 @@ def cauchy_stress(particles: Particles, last_substep: float) -> np.ndarray:
     now = particles._replace(deformation=particles.deformation.copy(), plastic=particles.plastic.copy())
     kirchhoff = np.empty((count, 3 * dim - 3))
     (transfer_2d if dim == 2 else transfer_3d).deform(now, kirchhoff, last_substep)
-    elastic = np.linalg.det(now.deformation)
+    elastic = np.abs(np.linalg.det(now.deformation))  # the laws do not tell an inverted particle from its mirror image
     plastic = np.where(particles.law == SNOW, 1.0 + now.plastic, np.exp(np.where(particles.law == SAND, now.plastic, 0.0)))
     if dim == 2:
         kirchhoff = np.column_stack([kirchhoff, _across(particles, kirchhoff, elastic)])

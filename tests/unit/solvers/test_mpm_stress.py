@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gpe_pl.config.datasets import dataset
+from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.data.ground_truth import generate_trajectory
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.solvers.materials import LAMBDA, MU, Fluid, Snow
@@ -114,6 +115,11 @@ def test_liquid_has_a_pressure_alone_at_rest() -> None:
         np.testing.assert_allclose(tensor(found), Fluid().bulk_modulus * math.log(squeezed) / squeezed * np.eye(3), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("material", ["elastomer", "snow"])
+def test_inverted_particles_have_the_stress_of_their_mirror_image(material: str) -> None:
+    np.testing.assert_allclose(stress_of(material, np.diag([0.99, -0.98])), stress_of(material, np.diag([0.99, 0.98])), rtol=1e-9)
+
+
 def test_sand_in_tension_has_no_stress() -> None:
     for dim in (2, 3):
         assert not stress_of("sand", np.diag((1.01,) * dim)).any()
@@ -155,6 +161,11 @@ def test_stress_carries_the_weight() -> None:
 
 def data(*more: str) -> Any:
     return dataset("data=snow", "size=tiny", *more)
+
+
+def test_only_true_and_false_say_whether_stress_is_stored() -> None:
+    with pytest.raises(ConfigError, match="stress"):  # the data set would have the name of one without stress
+        data("data.solver.stress=1")
 
 
 def test_data_sets_without_stress_are_those_of_before() -> None:

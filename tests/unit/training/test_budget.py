@@ -169,6 +169,7 @@ def test_a_measurement_that_fails_writes_nothing(tmp_path: Path) -> None:
         (["training.compile=auto"], True),
         (["trainer.matmul_precision=high"], True),
         (["training.push_fraction=0.9"], True),
+        (["training.cuda_graph=off"], False),  # on a CPU, which has none
         (["training.push_fraction=0", "training.unroll_steps=2"], True),
     ],
 )
@@ -180,6 +181,16 @@ def test_a_step_is_measured_again_where_its_time_is_another(overrides: list[str]
         return step_time_key(without_tables(values), *settings)
 
     assert (key(*overrides) != key()) == is_other
+
+
+def test_a_step_with_cuda_graphs_has_a_time_of_its_own_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    cfg = compose("fit", "size=tiny", "model=gpe_tuned")
+    trainer = construct(TrainerSettings, cfg.trainer, "trainer")
+    config: Any = OmegaConf.to_container(cfg, resolve=True)
+    values = without_tables(config)
+    monkeypatch.setattr(TrainerSettings, "device", "cuda")
+    keys = {step_time_key(values, replace(SETTINGS, cuda_graph=choice), trainer) for choice in ("auto", "off")}
+    assert len(keys) == 2
 
 
 @pytest.fixture

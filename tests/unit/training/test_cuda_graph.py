@@ -18,7 +18,7 @@ from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
-from gpe_pl.training.cuda_graph import MULTIPLE, CudaGraphs, FilledArguments, enlarged, sizes_of, without_further_nodes
+from gpe_pl.training.cuda_graph import MOST_EDGES, MULTIPLE, CudaGraphs, FilledArguments, Sizes, enlarged, sizes_of, without_further_nodes
 from gpe_pl.training.module import TrainingModule
 from tests import meshes
 
@@ -115,6 +115,16 @@ def test_sizes_have_a_margin_and_stay_while_they_suffice() -> None:
     assert first == {"sand": 2 * MULTIPLE, relation: 2 * MULTIPLE}
     assert enlarged({"sand": 127, relation: 128}, first) == first
     assert enlarged({"sand": 128, relation: 128}, first) == {"sand": 3 * MULTIPLE, relation: 2 * MULTIPLE}
+
+
+def test_further_nodes_have_few_edges() -> None:
+    relation = ("sand", "radius", "sand")
+    before: Sizes = {}
+    for nodes, edges in ((200, 4000), (250, 3000), (150, 1000), (255, 4400)):
+        before = enlarged({"sand": nodes, relation: edges}, before)
+        assert before["sand"] > nodes
+        assert before[relation] >= edges
+        assert (before[relation] - edges) / (before["sand"] - nodes) <= MOST_EDGES
 
 
 @pytest.fixture
