@@ -21,7 +21,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import SimulationError, Simulator, sound, step_all
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.boundary import search_tree
-from gpe_pl.trajectory.cells import cell_edges, mean_over_corners
+from gpe_pl.trajectory.cells import cell_edges
 from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.state import State, Stress
 
@@ -181,7 +181,7 @@ def _combined_stress(state: State, after: State, awake: Tensor, moved: Tensor) -
         return state.stress if not bool(awake.any()) else None
     node = after.stress.node.new_zeros(state.num_nodes, after.stress.node.shape[1]) if state.stress is None else state.stress.node.clone()
     node[awake] = after.stress.node[moved]
-    return Stress(node, node.new_empty(0, node.shape[1]) if state.cells is None else mean_over_corners(node, state.cells))
+    return Stress.of_nodes(node, state.cells)
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class FilledArguments:
 
     Args:
         arguments: arguments of some batch, which determine types, relations, channels and devices.
-        sizes: rows of the arrays; every node type needs one more than its batches have.
+        sizes: rows of the arrays, as ``enlarged`` returns them.
 
     Attributes:
         arguments: the arrays, in dictionaries and tuples as in a call.
@@ -85,8 +85,7 @@ class FilledArguments:
     def __init__(self, arguments: tuple[dict[Any, Any], ...], sizes: Sizes) -> None:
         self.sizes = sizes
         self.arguments = tuple({key: self._array(key, value) for key, value in values.items()} for values in arguments)
-        longest = max(size for key, size in sizes.items())
-        self._count = torch.arange(longest, device=pytree.tree_leaves(arguments)[0].device)
+        self._count = torch.arange(max(sizes.values()), device=pytree.tree_leaves(arguments)[0].device)
 
     def _array(self, key: str | EdgeType, value: Any) -> Any:
         size = self.sizes[key]

@@ -35,11 +35,9 @@ class Stress:
     cell: Array
 
     @classmethod
-    def of_nodes(cls, node: np.ndarray, cells: Array | None) -> Stress:
-        """Return a stress that is known at nodes. Stresses of cells are means over their corners."""
-        if cells is None or not len(cells):
-            return cls(node, np.zeros((0, node.shape[1])))
-        return cls(node, mean_over_corners(node, np.asarray(cells)))
+    def of_nodes(cls, node: Array, cells: Array | None) -> Stress:
+        """Return a stress that is known at nodes [node, component]. Stresses of cells are means over their corners. Without a mesh, ``cells`` is None."""
+        return cls(node, node[:0] if cells is None else mean_over_corners(node, cells))
 
     @property
     def node_von_mises(self) -> Array:
