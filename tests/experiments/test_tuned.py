@@ -14,7 +14,7 @@ from tests.runs import compose
 
 ALWAYS = sorted(path for group in ("training", "model") for path in (CONF / group).glob("data*/*.yaml"))
 COMPARED = sorted((CONF / "tuned").glob("*/*.yaml"))
-USED = {"sand_gns", "fem_gns", "mixed_gpe_tuned"}
+USED = {"sand_gns", "fem_gns", "mixed_gpe_tuned", "small_fluid_gns"}
 """Files of these choices are tested with the fast tests."""
 
 
@@ -40,8 +40,7 @@ def leaves(values: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
 @pytest.mark.parametrize("path", [*ALWAYS, *COMPARED], ids=lambda p: p.stem)
 def test_values_are_plain_and_files_are_named_after_choices(path: Path) -> None:
     assert "${" not in path.read_text()
-    expected = {"size": {"size"}, "size_model": {"size", "model"}, "data": {"data"}, "data_model": {"data", "model"}}
-    groups = {"data", "model"} if path.parent.parent.name == "model" else expected[path.parent.name]
+    groups = {"data", "model"} if path.parent.parent.name == "model" else set(path.parent.name.split("_"))
     assert choices(path).keys() == groups
 
 
