@@ -1,12 +1,14 @@
-"""Adds to a graph what ``nn.elastic_bodies`` needs to move bodies within a frame: cells, rest shapes, velocities, walls and corners of obstacles."""
+"""Adds to a graph what ``nn.elastic_bodies`` needs to move bodies within a frame: cells, rest shapes, velocities, walls, corners of obstacles, other bodies."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
@@ -27,13 +29,18 @@ from gpe_pl.graphs.features import Scales, from_centre
 from gpe_pl.graphs.search import as_array
 from gpe_pl.graphs.topology import GraphError, Topology
 from gpe_pl.schema import BOUNDARY, RADIUS, FeatureSpec
+from gpe_pl.trajectory.boundary import as_numpy
 from gpe_pl.trajectory.state import State
 
 NO_EDGES = np.empty((0, 2), np.int64)
+ATTACHED, FLATTEST = 1.8, 0.1
+"""Distance in rest spacings of the nodes to which loose nodes are attached, and least volume of such a cell over that of a box of its longest edge."""
+REACH = 5.0
+"""Largest distance in rest spacings of nodes of different bodies that may touch within a frame. A smaller radius of the graph limits it."""
 
 
 def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureSpec, scales: Scales, precision: torch.dtype) -> None:
-    """Add the cells of each material of meshes, their rest shape, velocities at the frame, walls and corners to a graph. ``GraphBuilder`` lists the entries.
+    """Add the cells of each material of meshes, their rest shape, velocities, and what they may touch to a graph. ``GraphBuilder`` lists the entries.
 
     Args:
         data: graph of the state.
@@ -52,9 +59,22 @@ def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureS
     data.gravity = (state.gravity[None] * scales.frame_dt**2).to(precision)
     compiled = works_on(state)
     for material in spec.meshes:
-        at_rest = _at_rest(topology, state, material, dim, precision)
+        at_rest = _at_rest(topology, state, material, dim, precision, scales.spacing)
         entries = (_entries_in_compiled_loops if compiled else _entries)(topology, state, material, at_rest, scales, precision)
-        data[material].update({"cell_index": at_rest.cell_index, "rest_pos": at_rest.pos, **entries})
+        touching = _touching(topology, state, material, REACH * scales.spacing, precision)
+        data[material].update({"cell_index": at_rest.cell_index, "rest_pos": at_rest.pos, **entries, **touching})
+
+
+def _touching(topology: Topology, state: State, material: str, reach: float, precision: torch.dtype) -> dict[str, Tensor]:
+    """Return the pairs of nodes of different bodies within ``reach`` and the radius, and the vector from the second to the first of each."""
+    edges, rows = topology.edges.get((material, RADIUS, material)), topology.rows[material]
+    if edges is None or topology.islands is None or not topology.edges[material, RADIUS, material].shape[1]:
+        return {"touch_index": rows.new_empty(0, 2), "touch": state.pos.new_empty(0, state.pos.shape[1], dtype=precision)}
+    body = topology.islands.body[material].to(rows.device)
+    first, second = edges[:, body[edges[0]] != body[edges[1]]]
+    way = topology.periodicity.shortest(state.pos[rows[first]] - state.pos[rows[second]])
+    near = way.square().sum(dim=1) < reach**2
+    return {"touch_index": torch.stack([first[near], second[near]], dim=1), "touch": way[near].to(precision)}
 
 
 def _entries(
@@ -129,7 +149,7 @@ class _AtRest:
 
     Attributes:
         pos: undeformed positions relative to the mean of the body [node, dim] in m; zero without cells.
-        cell_index: corners of each cell [cell, 2^dim].
+        cell_index: corners of each cell [cell, 2^dim], with those that attach loose nodes.
         surface: nodes of the edges at the surface of bodies in 2D, the body on the left [edge, 2]; empty in 3D.
         dtype: precision of the entries.
     """
@@ -141,7 +161,7 @@ class _AtRest:
 
 
 @torch.inference_mode(False)  # a rollout may be the first to ask, and training the next
-def _at_rest(topology: Topology, state: State, material: str, dim: int, precision: torch.dtype) -> _AtRest:
+def _at_rest(topology: Topology, state: State, material: str, dim: int, precision: torch.dtype, spacing: float) -> _AtRest:
     """Return what bodies have in all frames. It is kept with the virtual nodes of the mesh, which are the same object in all frames of a scene.
 
     Raises:
@@ -158,13 +178,42 @@ def _at_rest(topology: Topology, state: State, material: str, dim: int, precisio
         padding = cells[:, -1:].expand(-1, 2**dim - cells.shape[1])
         surface = oriented_edges(rest, cells) if dim == 2 else NO_EDGES
         centred = from_centre(rest, islands.body[material], islands.num_bodies).to(precision)
-        return _AtRest(centred, torch.cat([cells, padding], dim=1), surface, dtype)
+        every = torch.cat([cells, padding], dim=1)
+        if cells.shape[1] == dim + 1:
+            more = attaching_cells(as_numpy(rest), as_numpy(cells), as_numpy(islands.body[material]), ATTACHED * spacing)
+            more = np.concatenate([more, more[:, -1:].repeat(every.shape[1] - dim - 1, axis=1)], axis=1)
+            every = torch.cat([every, torch.from_numpy(more).to(device)])
+        return _AtRest(centred, every, surface, dtype)
 
     kept: dict[Any, _AtRest] = mesh.__dict__.setdefault("_cells_at_rest", {})  # not a field, so neither compared nor stored
     key = material, state.cell_dim, precision
     if key not in kept:
         kept[key] = make()
     return kept[key]
+
+
+def attaching_cells(
+    rest_pos: Float64[np.ndarray, "node dim"], cells: Int64[np.ndarray, "cell corner"], body: Int64[np.ndarray, " node"], reach: float
+) -> Int64[np.ndarray, "more corner"]:
+    """Return simplices that attach nodes without a cell to the body beside them; without cells such nodes would fly away from it.
+
+    Simplices have the loose node, and those nodes of cells of the same body within ``reach`` [m] that give the largest volume for the size. A node without
+    enough such neighbours stays loose.
+    """
+    dim, in_cells = rest_pos.shape[1], np.zeros(len(rest_pos), bool)
+    in_cells[cells] = True
+    own, found = np.nonzero(in_cells)[0], []
+    for node in np.nonzero(~in_cells & (body >= 0))[0]:
+        distance = np.linalg.norm(rest_pos[own] - rest_pos[node], axis=1)
+        near = own[(distance < reach) & (body[own] == body[node])]
+        choices = np.array([*combinations(near.tolist(), dim)], dtype=np.int64).reshape(-1, dim)
+        edges = rest_pos[choices] - rest_pos[node]
+        quality = np.abs(np.linalg.det(edges)) / np.linalg.norm(edges, axis=2).max(axis=1, initial=1e-300) ** dim
+        best = max(quality.max(initial=0.0) * (1.0 - 1e-6), FLATTEST)
+        found += [
+            [node, *choice] for choice in choices[quality > best]
+        ]  # all of the best, so that neither numbers nor mirror images matter
+    return np.array(found, dtype=np.int64).reshape(-1, dim + 1)
 
 
 def _in_state(edge_index: Tensor | None, boundary_rows: Tensor | None) -> Tensor | None:

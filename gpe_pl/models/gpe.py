@@ -168,6 +168,7 @@ class GPE(Model):
         elastic: cells of meshes move their nodes through the whole frame by a constitutive law that the model learns (see ``nn.elastic_bodies``).
         wall_distance: with ``elastic``, initial value of the learned distance from walls at which nodes stop, in rest spacings.
         wall_layer: with ``elastic``, initial thickness of the learned elastic layer of walls in front of that, in rest spacings; 0 stands for no layer.
+        body_layer: with ``elastic``, initial thickness of the learned layer between bodies, in rest spacings; 0 stands for no layer.
         only_contacts: with ``elastic`` and the ``contact`` decoder, the network adds forces between bodies, and nothing within bodies or at walls.
         viscous: with ``elastic``, cells also have a viscous stress with a learned constant. Choose false for data of solids without damping.
         stress_unit: with ``stress`` and without ``elastic``, what the network decodes: the stress in the unit of the data set, or with ``strain`` the stress
@@ -199,6 +200,7 @@ class GPE(Model):
         elastic: bool = False,
         wall_distance: Annotated[float, Field(ge=0)] = 0.0,
         wall_layer: Annotated[float, Field(ge=0)] = 0.0,
+        body_layer: Annotated[float, Field(ge=0)] = 0.0,
         only_contacts: bool = False,
         viscous: bool = True,
         stress_unit: StressUnit = "data",
@@ -219,6 +221,7 @@ class GPE(Model):
             elastic=elastic,
             wall_distance=wall_distance,
             wall_layer=wall_layer,
+            body_layer=body_layer,
             only_contacts=only_contacts,
             viscous=viscous,
             stress_unit=stress_unit,
@@ -229,9 +232,7 @@ class GPE(Model):
                 f"such as {MESH_MATERIALS[0]}; the data set has {', '.join(spec.materials)}; or choose law=none"
             )
         if stress_unit == "strain" and (elastic or not (stress and spec.cells and spec.meshes)):
-            raise CellError(
-                "model.stress_unit=strain needs model.stress=true model.elastic=false graph.cells=true and a material with cells"
-            )
+            raise CellError("model.stress_unit=strain needs model.stress=true model.elastic=false graph.cells=true and cells of a material")
         if island_momentum != "ignored" and not spec.islands:
             raise IslandError(f"model.island_momentum={island_momentum} needs graph.islands=true")
         self.bodies = tuple(r[0] for r in spec.relations if r[1] == CELL) if decoder == "contact" else ()
@@ -291,9 +292,8 @@ class GPE(Model):
             forces = [r for r in forces if not (elastic and only_contacts and BOUNDARY in r)]  # the law has the walls
             self.pair_decoder = nn.ModuleDict({self.key(r): PairForce(spec, r, hidden) for r in forces})
         if elastic:
-            self.elastic_bodies = ElasticBodies(
-                {m: spec.param_channels[m] if m in read else 0 for m in spec.meshes}, spec.dim, wall_distance, wall_layer, viscous
-            )
+            count = {m: spec.param_channels[m] if m in read else 0 for m in spec.meshes}
+            self.elastic_bodies = ElasticBodies(count, spec.dim, wall_distance, wall_layer, viscous, body_layer)
             zeroed = [cast(MLP, self.node_decoder[m])[2] for m in spec.meshes] if decoder != "pair" else []
             zeroed += [cast(PairForce, force).lin_out for force in self.pair_decoder.values()] if decoder == "pair" or self.bodies else []
             for layer in zeroed:  # training starts from the motion by cells and walls alone

@@ -1,7 +1,7 @@
 """Elastic bodies of a graph: their cells and the walls beside them move the nodes through the whole frame (see ``nn.elastic_motion``).
 
 The network learns the constants of the cells as functions of the material parameters, a factor of the friction, the distance at which walls stop nodes, and the
-elastic layer in front of them. What it predicts besides, such as contact between bodies, acts as a constant acceleration.
+elastic layers in front of walls and between bodies. What it predicts besides acts as a constant acceleration.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from torch_geometric.data import HeteroData
 from gpe_pl.errors import GpeError
 from gpe_pl.nn.elastic_bodies_kernels import move_bodies
 from gpe_pl.nn.elastic_motion import LOGARITHM_SCALE, MAX_SUBSTEPS, STABLE, Cells, Constants, Corners, Walls, cauchy_stress, elastic_motion
+from gpe_pl.nn.elastic_touch import APPROACH, SHARE, BodyLayer, Touching
 from gpe_pl.system.compiled import is_wanted
 
 MAX_CACHED = 64
 """Largest number of graphs whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
-FIRST_DAMPING = 0.1
-"""Damping of the layer of walls before training, as a fraction of critical damping."""
+FIRST_STIFFNESS, FIRST_DAMPING, FIRST_MOST_FRICTION = 0.5, 0.1, 0.7
+"""Stiffness, damping and largest friction of the layer of walls before training; the damping is a fraction of the critical one."""
 ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "cell_index", "corner_index", "corner")
 """Entries of a material's store that the law reads."""
 
@@ -47,9 +48,10 @@ class Moved(NamedTuple):
 
 
 class WallLayer(nn.Module):
-    """Elastic layer of walls, of the material of the body that it touches: thickness, stiffness and damping are learned.
+    """Elastic layer of walls, of the material of the body that it touches: thickness, stiffness, damping and largest friction are learned.
 
-    The material point method has such a layer. Its particles feel a wall as soon as they share a cell of the grid with it, and deform on their way to it.
+    The material point method has such a layer. Its particles feel a wall as soon as they share a cell of the grid with it, and deform on their way to it. The
+    layer slips: bodies slide even on walls to which they should stick. So a friction μ acts as ``μ / (1 + μ/M)``, with the largest friction M.
 
     Args:
         thickness: thickness before training, in rest spacings; 0 stands for no layer, which is not learned.
@@ -60,15 +62,16 @@ class WallLayer(nn.Module):
         self.has_thickness = thickness > 0
         if self.has_thickness:
             self.log_thickness = nn.Parameter(torch.tensor(float(thickness)).log())
-            self.log_stiffness = nn.Parameter(torch.zeros(()))
+            self.log_stiffness = nn.Parameter(torch.tensor(FIRST_STIFFNESS).log())
             self.log_damping = nn.Parameter(torch.tensor(FIRST_DAMPING).log())
+            self.log_most_friction = nn.Parameter(torch.tensor(FIRST_MOST_FRICTION).log())
 
-    def values(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the thickness in rest spacings, the stiffness as a factor of λ + 2μ, and the damping per square root of the stiffness."""
+    def values(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the thickness in rest spacings, the stiffness as a factor of λ + 2μ, the damping per square root of the stiffness, and 1/M."""
         if not self.has_thickness:
             nothing = torch.zeros(())
-            return nothing, nothing, nothing
-        return self.log_thickness.exp(), self.log_stiffness.exp(), 2.0 * self.log_damping.exp()
+            return nothing, nothing, nothing, nothing
+        return self.log_thickness.exp(), self.log_stiffness.exp(), 2.0 * self.log_damping.exp(), (-self.log_most_friction).exp()
 
     def of_nodes(self, modulus: Float[Tensor, " node"], mass: Float[Tensor, " node"], spacing: Tensor) -> Float[Tensor, "node 3"] | None:
         """Return the layer of each node as ``elastic_motion.Walls`` has it; None without a layer.
@@ -80,7 +83,7 @@ class WallLayer(nn.Module):
         """
         if not self.has_thickness:
             return None
-        thickness, stiffness, damping = (value.to(modulus) for value in self.values())
+        thickness, stiffness, damping, _ = (value.to(modulus) for value in self.values())
         per_mass = stiffness * modulus / (thickness * mass)
         return torch.stack([(thickness * spacing).expand_as(per_mass), per_mass, damping * per_mass.sqrt()], dim=1)
 
@@ -96,6 +99,7 @@ class ElasticBodies(nn.Module):
         wall_distance: distance at which walls stop nodes before training, in rest spacings.
         wall_layer: thickness of the elastic layer of walls before training, in rest spacings; 0 stands for no layer.
         viscous: cells have a viscous stress, whose constant is learned; otherwise it is negligible.
+        body_layer: thickness of the layer between bodies before training, in rest spacings; 0 stands for no layer.
     """
 
     acceleration_unit: Tensor
@@ -103,7 +107,13 @@ class ElasticBodies(nn.Module):
     stress_unit: Tensor
 
     def __init__(
-        self, param_channels: dict[str, int], dim: int, wall_distance: float = 0.0, wall_layer: float = 0.0, viscous: bool = True
+        self,
+        param_channels: dict[str, int],
+        dim: int,
+        wall_distance: float = 0.0,
+        wall_layer: float = 0.0,
+        viscous: bool = True,
+        body_layer: float = 0.0,
     ) -> None:
         super().__init__()
         self.dim = dim
@@ -111,6 +121,7 @@ class ElasticBodies(nn.Module):
         self.log_friction = nn.ParameterDict({m: torch.zeros(()) for m in param_channels})
         self.wall_distance = nn.ParameterDict({m: torch.tensor(float(wall_distance)) for m in param_channels})
         self.wall_layer = nn.ModuleDict({m: WallLayer(wall_layer) for m in param_channels})
+        self.body_layer = nn.ModuleDict({m: BodyLayer(body_layer, count, LOGARITHM_SCALE) for m, count in param_channels.items()})
         self.register_buffer("acceleration_unit", torch.ones((), dtype=torch.float64))
         self.register_buffer("spacing", torch.ones((), dtype=torch.float64))
         self.register_buffer("stress_unit", torch.ones((), dtype=torch.float64))
@@ -177,17 +188,31 @@ class ElasticBodies(nn.Module):
         of_node = [value.to(device) for value in constants]
         lam, mu, eta = ((value * modulus)[cells.nodes].mean(dim=1) for value in of_node)
         normal, gap, friction = store["wall"].split([self.dim, 1, 1], dim=1)
-        layer = cast(WallLayer, self.wall_layer[m]).of_nodes(of_node[0] + 2.0 * of_node[1], mass.to(device), spacing)
-        walls = Walls(normal, gap[:, 0] - self.wall_distance[m].to(device) * spacing, friction[:, 0] * friction_factor, layer)
+        wall_layer = cast(WallLayer, self.wall_layer[m])
+        layer, slip = wall_layer.of_nodes(of_node[0] + 2.0 * of_node[1], mass.to(device), spacing), wall_layer.values()[3].to(device)
+        friction = friction[:, 0] * friction_factor
+        walls = Walls(normal, gap[:, 0] - self.wall_distance[m].to(device) * spacing, friction / (1.0 + slip * friction), layer)
         ends, corner = store["corner_index"], store["corner"]
-        corners = Corners(ends, body_pos.double()[ends[:, 0]] + corner[:, : self.dim], corner[:, self.dim] * friction_factor.detach())
+        at_corner = corner[:, self.dim] * friction_factor
+        at_corner = (at_corner / (1.0 + slip * at_corner)).detach()
+        corners = Corners(ends, body_pos.double()[ends[:, 0]] + corner[:, : self.dim], at_corner)
+        touching = self._touching(m, data, own.to(device), (of_node[0], of_node[1]))
         way, at_end, law = elastic_motion(
-            body_pos, velocity, forcing + gravity, mass.to(device), (lam, mu, eta), cells, walls, corners, held
+            body_pos, velocity, forcing + gravity, mass.to(device), (lam, mu, eta), cells, walls, corners, held, touching
         )
         stress = None
         if with_stress:
             stress = (cauchy_stress(body_pos + way, law, cells) / self.stress_unit.to(device)).to(acceleration)
         return ((way - mean - gravity) / unit).to(acceleration), at_end.to(mass.device), stress
+
+    def _touching(self, m: str, data: HeteroData, params: Tensor, lame: tuple[Tensor, Tensor]) -> Touching:
+        """Return the pairs of nodes of different bodies, on the device of the constants λ and μ of the nodes."""
+        layer, store = cast(BodyLayer, self.body_layer[m]), data[m]
+        if not layer.has_thickness or not len(store.touch_index):
+            return Touching.nothing(params.new_empty(0, self.dim, dtype=torch.float64))
+        lam, mu = lame
+        nodes, spacing = store.touch_index.to(lam.device), self.spacing.to(lam.device)
+        return Touching(nodes, store.touch.to(lam.device).double(), layer.law_of(nodes, params, lam + 2.0 * mu, spacing))
 
     def _moved_at_once(
         self, m: str, data: HeteroData, acceleration: Tensor, params: Tensor | None, mass: Tensor, with_stress: bool
@@ -205,12 +230,16 @@ class ElasticBodies(nn.Module):
         components = 4 if self.dim == 2 else 6
         stress = np.empty((len(mass) if with_stress else 0, components), moved.dtype)
         own = mass.new_empty(len(mass), 0) if params is None else params
+        touching = Touching.nothing(acceleration.new_empty(0, self.dim, dtype=torch.float64))
+        if cast(BodyLayer, self.body_layer[m]).has_thickness and len(store.touch_index):
+            lam, mu, _ = cast(Constants, self.constants[m])(own)
+            touching = self._touching(m, data, own, (lam, mu))
         held = _array(store.prescribed) if "prescribed" in store else np.zeros((0, self.dim), bool)
         entries = (host[key] for key in ("body_pos", "velocity", "wall", "corner_index", "corner"))
         move_bodies(
             _array(own), _array(law["weight"]), _array(law["bias"]), LOGARITHM_SCALE, _array(acceleration), _array(data.gravity),
-            _array(mass_on_host), held, *map(_array, entries), *cells.arrays, np.array([float(x) for x in units]),
-            (float(MAX_SUBSTEPS), STABLE), moved, at_end, stress,
+            _array(mass_on_host), held, *map(_array, entries), *map(_array, (touching.nodes, touching.way, touching.law)), *cells.arrays,
+            np.array([float(x) for x in units]), (float(MAX_SUBSTEPS), STABLE, SHARE, APPROACH), moved, at_end, stress,
         )  # fmt: skip
         found, velocity, tensions = (torch.from_numpy(a).to(mass.device) for a in (moved, at_end, stress))
         return found, velocity, tensions if with_stress else None

@@ -11,7 +11,8 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from gpe_pl.nn.elastic_kernels import HEAVY, LOG_SMALLEST, move_forward
+from gpe_pl.nn.elastic_kernels import HEAVY, LOG_SMALLEST, TORN, move_forward
+from gpe_pl.nn.elastic_touch_kernels import soften_touching
 from gpe_pl.trajectory.strain import HEXAHEDRON, POINTS_TO_CORNERS, SMALLEST_RATIO
 
 KEPT = 2
@@ -21,8 +22,8 @@ KEPT = 2
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def move_bodies(
-    params, weight, bias, scale, acceleration, gravity, mass, held, body_pos, velocity, wall, corner_index, corner, nodes, gradient, volume, rate, cell_start,
-    node_start, units, limits, moved, at_end, stress,
+    params, weight, bias, scale, acceleration, gravity, mass, held, body_pos, velocity, wall, corner_index, corner, touching, way, touch, nodes, gradient,
+    volume, rate, cell_start, node_start, units, limits, moved, at_end, stress,
 ):  # fmt: skip
     """Compute the motion of the bodies of one material in all scenes of a graph.
 
@@ -35,17 +36,18 @@ def move_bodies(
         mass: masses [node].
         held: axes along which nodes keep their velocity [node, dim], or without rows if there are none.
         body_pos, velocity, wall, corner_index, corner: entries of the graph, see ``graphs.builder``.
+        touching, way, touch: pairs of nodes of different bodies, see ``elastic_touch.Touching``; ``touch`` is softened in place.
         nodes, gradient, volume, rate: of cells, see ``elastic_motion.Cells``.
         cell_start, node_start: first cell and node of each scene, and their numbers [scene + 1].
-        units: units of accelerations, of length, and of stresses, factor of the friction, distance in m at which walls stop nodes, and three values of the
+        units: units of accelerations, of length, and of stresses, factor of the friction, distance in m at which walls stop nodes, and four values of the
             layer in front of it, see ``elastic_bodies.WallLayer``.
-        limits: largest number of substeps, and length of a substep as a fraction of the largest one that is stable.
+        limits: largest number of substeps, length of a substep as a fraction of the largest one that is stable, and two constants of ``soften_touching``.
         moved: accelerations without gravity that move the nodes as far [node, dim]; a result.
         at_end: velocities at the end of the frame [node, dim] in m/frame; a result.
         stress: Cauchy stress at the end of the frame [node, component], or without rows; a result.
     """
     num_nodes, dim = acceleration.shape
-    acceleration_unit, spacing, stress_unit, friction_factor, wall_distance, thickness, layer_stiffness, layer_damping = units
+    acceleration_unit, spacing, stress_unit, friction_factor, wall_distance, thickness, layer_stiffness, layer_damping, slip = units
     pos, vel, forcing, weights = (
         np.empty((num_nodes, dim)),
         np.empty((num_nodes, dim)),
@@ -55,7 +57,8 @@ def move_bodies(
     normal, gap, friction = np.empty((num_nodes, dim)), np.empty(num_nodes), np.empty(num_nodes)
     for s in range(len(node_start) - 1):
         for n in range(node_start[s], node_start[s + 1]):
-            gap[n], friction[n] = max(wall[n, dim] - wall_distance, 0.0), wall[n, dim + 1] * friction_factor
+            gap[n], coefficient = max(wall[n, dim] - wall_distance, 0.0), wall[n, dim + 1] * friction_factor
+            friction[n] = coefficient / (1.0 + slip * coefficient)
             for a in range(dim):
                 pos[n, a], vel[n, a], normal[n, a] = body_pos[n, a], velocity[n, dim + a], wall[n, a]
                 forcing[n, a], weights[n, a] = acceleration[n, a] * acceleration_unit + gravity[s, a], mass[n]
@@ -63,7 +66,8 @@ def move_bodies(
                     forcing[n, a], weights[n, a] = 0.0, HEAVY
     point, point_friction = np.empty((len(corner), dim)), np.empty(len(corner))
     for k in range(len(corner)):
-        point_friction[k] = corner[k, dim] * friction_factor
+        coefficient = corner[k, dim] * friction_factor
+        point_friction[k] = coefficient / (1.0 + slip * coefficient)
         for a in range(dim):
             point[k, a] = pos[corner_index[k, 0], a] + corner[k, a]
     of_node = _constants(params, weight, bias, scale)
@@ -75,19 +79,15 @@ def move_bodies(
     for s in range(len(number) if thickness > 0.0 else 0):
         for n in range(node_start[s], node_start[s + 1]):
             stiffness = layer_stiffness * (of_node[n, 0] + 2.0 * of_node[n, 1]) * spacing / (thickness * mass[n])
-            layer[n, 0], layer[n, 1] = thickness, min(stiffness, float(number[s]) ** 2)
+            layer[n, 0], layer[n, 1] = thickness, min(stiffness, 0.5 * float(number[s]) ** 2)
             layer[n, 2] = min(layer_damping * math.sqrt(stiffness), 0.5 * number[s])
-    pair_start, scene = np.zeros(len(node_start), np.int64), 0
-    for k in range(len(corner)):
-        while corner_index[k, 0] >= node_start[scene + 1]:
-            scene += 1
-            pair_start[scene] = k
-    pair_start[scene + 1 :] = len(corner)
+    pair_start, touch_start = _first_of_scenes(corner_index, node_start), _first_of_scenes(touching, node_start)
+    soften_touching(touching, way, touch, mass, number, node_start, touch_start, limits[2], limits[3])
     path, speed_path, pushed = np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim))
     contacts = np.zeros((KEPT, len(corner), 6))
     move_forward(
-        pos, vel, forcing, weights, lam, mu, eta, normal, gap, friction, layer, point, point_friction, corner_index, nodes, gradient, volume,
-        cell_start, node_start, pair_start, number, path, speed_path, pushed, contacts, at_end,
+        pos, vel, forcing, weights, lam, mu, eta, normal, gap, friction, layer, point, point_friction, way, touch, corner_index, touching, nodes,
+        gradient, volume, cell_start, node_start, pair_start, touch_start, number, path, speed_path, pushed, contacts, at_end,
     )  # fmt: skip
     for s in range(len(number)):
         last = path[number[s] % KEPT]
@@ -98,6 +98,19 @@ def move_bodies(
                 pos[n, a] += way
     if len(stress):
         _write_stress(pos, lam, mu, nodes, gradient, volume, stress_unit, stress)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _first_of_scenes(pairs, node_start):
+    """Return the first of the pairs of nodes of each scene, and their number [scene + 1]. The pairs are in the order of the scenes."""
+    start, scene = np.zeros(len(node_start), np.int64), 0
+    for k in range(len(pairs)):
+        while pairs[k, 0] >= node_start[scene + 1]:
+            scene += 1
+            start[scene] = k
+    start[scene + 1 :] = len(pairs)
+    return start
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -145,9 +158,17 @@ def _deformation(pos, nodes, gradient, cell, q, f):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _soften(pos, lam, mu, eta, nodes, gradient, rate, first, end, most, stable):
-    """Soften cells of a scene that need more than ``most`` substeps, in place, and return the number of substeps; see ``Cells.substeps``."""
+    """Soften cells of a scene that need more than ``most`` substeps, and torn cells, in place; return the number of substeps. See ``Cells.substeps``."""
     dim, largest, f = pos.shape[1], 0.0, np.empty((3, 3))
     for cell in range(first, end):
+        for q in range(gradient.shape[1]):
+            _deformation(pos, nodes, gradient, cell, q, f)
+            norm = 0.0
+            for i in range(dim):
+                for j in range(dim):
+                    norm += f[i, j] * f[i, j]
+            if norm > TORN**2:
+                lam[cell] = mu[cell] = eta[cell] = 0.0
         stiffness, damping = -math.inf, -math.inf
         for q in range(gradient.shape[1]):
             ratio = max(_deformation(pos, nodes, gradient, cell, q, f), SMALLEST_RATIO)

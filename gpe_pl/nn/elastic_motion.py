@@ -10,9 +10,10 @@ stress, as in ``solvers.fem.elements`` (Bonet & Wood 2008, section 6.4.3)::
 
     P = μ F + (λ log J − μ)/J cof F + η F (Fᵀ Ḟ + Ḟᵀ F)
 
-A node that would enter the plane of its nearest wall loses just enough normal velocity to arrive on it. Walls may have an elastic layer in front of this plane,
-as a spring and a damper on each node in it, which do not pull. Coulomb friction takes tangential velocity. Forces of cells change neither the linear nor the
-angular momentum of a body.
+A node that would enter the plane of its nearest wall loses just enough normal velocity to arrive on it. Walls may have an elastic layer in front of this plane.
+It pushes a node at distance d with the acceleration ``k (D − d)²/D``, with the thickness D and the stiffness per mass k, and damps its motion towards the wall.
+Coulomb friction takes tangential velocity. Bodies may act on each other (see ``nn.elastic_touch``). Cells that are torn at the start of a frame carry no
+forces. Forces of cells change neither the linear nor the angular momentum of a body.
 
 Units: time is in frames, length in m, and masses in any unit. λ and μ are in that unit of mass per m^(dim − 2) and frame², and η is in that times a frame.
 """
@@ -30,7 +31,8 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from gpe_pl.nn.elastic_kernels import DEEPEST, HEAVY, LOG_SMALLEST, move_forward, pull_back
+from gpe_pl.nn.elastic_kernels import DEEPEST, HEAVY, LOG_SMALLEST, TORN, move_forward, pull_back
+from gpe_pl.nn.elastic_touch import Touching, touching_forces
 from gpe_pl.nn.fused import works_on
 from gpe_pl.trajectory.strain import HEXAHEDRON, POINTS_TO_CORNERS, SMALLEST_RATIO, shape_gradients
 
@@ -171,7 +173,7 @@ class ElasticMotion(NamedTuple):
     Attributes:
         displacement: in m [node, dim].
         velocity: velocity at the end in m/frame [node, dim].
-        law: the law of each cell [cell], softened where ``MAX_SUBSTEPS`` would not suffice.
+        law: the law of each cell [cell], softened where ``MAX_SUBSTEPS`` would not suffice, and zero in torn cells.
     """
 
     displacement: Float[Tensor, "node dim"]
@@ -189,6 +191,7 @@ def elastic_motion(
     walls: Walls,
     corners: Corners | None = None,
     held: Bool[Tensor, "node dim"] | None = None,
+    touching: Touching | None = None,
 ) -> ElasticMotion:
     """Return the motion over a frame.
 
@@ -202,6 +205,7 @@ def elastic_motion(
         walls: planes that nodes do not enter.
         corners: points that do not pass edges of bodies; None stands for none. Derivatives take the place of their contact on the edge as constant.
         held: axes along which nodes keep their velocity, whatever acts on them; None stands for none.
+        touching: nodes of different bodies that act on each other; None stands for none.
     """
     if corners is None:
         corners = Corners(cells.nodes.new_empty(0, 2), pos.new_empty(0, pos.shape[1]), pos.new_empty(0))
@@ -211,18 +215,21 @@ def elastic_motion(
         forcing, axis_mass = torch.where(held, 0.0, forcing), torch.where(held, HEAVY, axis_mass)
     gap = walls.gap.clamp(min=0.0)  # a node behind a plane is not pushed out at once
     layer = pos.new_zeros(len(pos), 3) if walls.layer is None else _stable_layer(walls.layer, number, cells)
-    values = [
-        t.double()
-        for t in (pos, vel, forcing, axis_mass, *softened, walls.normal, gap, walls.friction, layer, corners.point, corners.friction)
-    ]
+    of_node = number.repeat_interleave(cells.node_start.diff(), output_size=len(pos))
+    touching = (touching or Touching.nothing(pos)).softened(mass.double(), of_node)
+    contacts = (walls.normal, gap, walls.friction, layer, corners.point, corners.friction, touching.way, touching.law)
+    values = [t.double() for t in (pos, vel, forcing, axis_mass, *softened, *contacts)]
     move: Any = _Motion.apply if works_on(*values) else plain_motion
-    displacement, velocity = move(*values, corners.nodes, cells, number)
+    displacement, velocity = move(*values, corners.nodes, touching.nodes, cells, number)
     return ElasticMotion(displacement, velocity, softened)
 
 
 def _softened_law(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> tuple[Law, Int64[Tensor, " scene"]]:
-    """Return the law of each cell, softened where ``MAX_SUBSTEPS`` would not suffice, and the number of substeps of each scene."""
-    lam, mu, eta = (constant.double() for constant in law)
+    """Return the law of each cell, softened where ``MAX_SUBSTEPS`` would not suffice and zero where it is torn, and the substeps of each scene."""
+    corner = pos.detach().double()[cells.nodes]
+    square = torch.einsum("cai,cqaj->cqij", corner - corner[:, :1], cells.gradient).square().sum(dim=(2, 3))
+    intact = (square <= TORN**2).all(dim=1)
+    lam, mu, eta = (torch.where(intact, constant.double(), 0.0) for constant in law)
     number, excess = cells.substeps(pos.double(), (lam, mu, eta))
     return (lam / excess**2, mu / excess**2, eta / excess), number
 
@@ -241,7 +248,10 @@ def plain_motion(
     layer: Tensor,
     point: Tensor,
     point_friction: Tensor,
+    way: Tensor,
+    touch: Tensor,
     pair: Tensor,
+    touch_nodes: Tensor,
     cells: Cells,
     number: Tensor,
 ) -> tuple[Tensor, Tensor]:
@@ -252,11 +262,15 @@ def plain_motion(
     """
     own = number.repeat_interleave(cells.node_start.diff(), output_size=len(pos))
     step = (1.0 / own.double())[:, None]
+    touching = Touching(touch_nodes, way, touch)
     rounds = [torch.from_numpy(some).to(pos.device) for some in _in_rounds(pair, len(pos))]
     corners = [Corners(pair[some], point[some], point_friction[some]) for some in rounds]
     y, velocity = pos, vel
     for k in range(int(own.max()) + 1 if len(own) else 0):
-        total = forcing + _internal(y, velocity, (lam, mu, eta), cells) / mass
+        force = _internal(y, velocity, (lam, mu, eta), cells)
+        if len(touch_nodes):
+            force = force + touching_forces(y - pos, velocity, touching)
+        total = forcing + force / mass
         half = torch.where(torch.logical_or(own == k, torch.full_like(own, k == 0, dtype=torch.bool)), 0.5, 1.0)[:, None]
         pushed = velocity + half * step * total
         moves = (own > k)[:, None]
@@ -271,7 +285,7 @@ def _stable_layer(layer: Float[Tensor, "node 3"], number: Int64[Tensor, " scene"
     """Return the layer of each node, softened where the substeps of its scene would be too long for it."""
     rate = number.repeat_interleave(cells.node_start.diff(), output_size=len(layer)).to(layer)
     thickness, stiffness, damping = layer.unbind(dim=1)
-    return torch.stack([thickness, torch.minimum(stiffness, rate.square()), torch.minimum(damping, 0.5 * rate)], dim=1)
+    return torch.stack([thickness, torch.minimum(stiffness, 0.5 * rate.square()), torch.minimum(damping, 0.5 * rate)], dim=1)
 
 
 def _stopped(velocity: Tensor, moved: Tensor, normal: Tensor, gap: Tensor, friction: Tensor, layer: Tensor, step: Tensor) -> Tensor:
@@ -279,7 +293,8 @@ def _stopped(velocity: Tensor, moved: Tensor, normal: Tensor, gap: Tensor, frict
     along = (velocity * normal).sum(dim=1)
     distance = gap + (moved * normal).sum(dim=1)
     thickness, stiffness, damping = layer.unbind(dim=1)
-    soft = torch.where(distance < thickness, step * (stiffness * (thickness - distance) - damping * along), 0.0)
+    push = stiffness * (thickness - distance).square() / thickness.clamp(min=1e-300)
+    soft = torch.where(distance < thickness, step * (push - damping * along.clamp(max=0.0)), 0.0)
     change = torch.maximum(-distance / step - along, soft)
     hits = (change > 0) & (normal != 0).any(dim=1)
     tangential = velocity - along[:, None] * normal
@@ -424,14 +439,17 @@ class _Motion(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
-        *values, pair, cells, number = inputs
+        *values, pair, touch_nodes, cells, number = inputs
         values = [t.detach().contiguous() for t in values]
         pos, arrays, most = values[0], [t.numpy() for t in values], int(number.max())
         nodes, gradient, volume, _, cell_start, node_start = cells.arrays
         path, speed_path, pushed = np.empty((most + 1, *pos.shape)), np.empty((most + 1, *pos.shape)), np.empty((most, *pos.shape))
-        pairs = np.ascontiguousarray(pair.numpy())
-        pair_start = np.searchsorted(np.searchsorted(node_start, pairs[:, 0], side="right") - 1, np.arange(cells.num_scenes + 1))
-        geometry = (pairs, nodes, gradient, volume, cell_start, node_start, pair_start, number.numpy())
+        pairs, touching = np.ascontiguousarray(pair.numpy()), np.ascontiguousarray(touch_nodes.numpy())
+        pair_start, touch_start = (
+            np.searchsorted(np.searchsorted(node_start, of_scenes[:, 0], side="right") - 1, np.arange(cells.num_scenes + 1))
+            for of_scenes in (pairs, touching)
+        )
+        geometry = (pairs, touching, nodes, gradient, volume, cell_start, node_start, pair_start, touch_start, number.numpy())
         contacts = np.zeros((most, len(pairs), 6))
         last_vel = np.empty_like(arrays[0])
         move_forward(*arrays, *geometry, path, speed_path, pushed, contacts, last_vel)
@@ -443,12 +461,12 @@ class _Motion(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor, grad_last: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        pos, vel, forcing, mass, lam, mu, eta, normal, gap, friction, layer, *_ = (t.numpy() for t in ctx.saved_tensors)
-        found = [np.zeros_like(a) for a in (pos, vel, forcing, lam, mu, eta, gap, friction, layer)]
-        constants = (mass, lam, mu, eta, normal, gap, friction, layer)
+        pos, vel, forcing, mass, lam, mu, eta, normal, gap, friction, layer, _, _, way, touch = (t.numpy() for t in ctx.saved_tensors)
+        found = [np.zeros_like(a) for a in (pos, vel, forcing, lam, mu, eta, gap, friction, layer, way, touch)]
+        constants = (mass, lam, mu, eta, normal, gap, friction, layer, way, touch)
         pull_back(grad.contiguous().numpy(), grad_last.contiguous().numpy(), *ctx.paths, *constants, *ctx.geometry, *found)
-        pos, vel, forcing, lam, mu, eta, gap, friction, layer = (torch.from_numpy(g) for g in found)
-        return pos, vel, forcing, None, lam, mu, eta, None, gap, friction, layer, None, None, None, None, None
+        pos, vel, forcing, lam, mu, eta, gap, friction, layer, way, touch = (torch.from_numpy(g) for g in found)
+        return pos, vel, forcing, None, lam, mu, eta, None, gap, friction, layer, None, None, way, touch, None, None, None, None
 
 
 class Constants(nn.Module):

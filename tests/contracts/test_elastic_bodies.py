@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -9,6 +10,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch_geometric.data import Batch
 
@@ -18,6 +21,7 @@ from gpe_pl.geometry.shape_values import moved as moved_shape
 from gpe_pl.geometry.shapes import Box, domain_walls
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
+from gpe_pl.graphs.elastic_cells import REACH, attaching_cells
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.approximate import Repeating, Sleeping
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -110,7 +114,7 @@ def beside_an_obstacle(seed: int, kind: str, num_bodies: int) -> State:
 def test_the_compiled_motion_equals_the_plain_one(
     kind: str, is_double: bool, tolerance: float, stiffness: float, wall_layer: float
 ) -> None:
-    simulated = simulator(("solid",), 3 if kind == "tetrahedra" else 2, stress=True, wall_layer=wall_layer)
+    simulated = simulator(("solid",), 3 if kind == "tetrahedra" else 2, stress=True, wall_layer=wall_layer, body_layer=3.0)
     build, model = simulated.builder, cast(GPE, simulated.model)
     if is_double:
         build, model = DoubleBuilder(build.config, build.metadata), model.double()
@@ -118,7 +122,9 @@ def test_the_compiled_motion_equals_the_plain_one(
         model.get_parameter("elastic_bodies.constants.solid.logarithm.bias").add_(stiffness)
     graph = batched([build(beside_an_obstacle(seed, kind, count)) for seed, count in ((0, 1), (1, 2), (2, 1))])
     store = graph["solid"]
-    assert kind == "tetrahedra" or len(store.corner)
+    assert (kind == "tetrahedra" or len(store.corner)) and len(store.touch)
+    if stiffness:
+        store.body_pos[3] += 5.0 * scenes.SPACING  # tears the cells at this node
     forces = {"solid": torch.randn(store.pos.shape, generator=torch.Generator().manual_seed(0)).to(build.precision)}
     inputs = graph, forces, {"solid": store.material_params.to(build.precision)}, {"solid": store.mass}, True
     with torch.no_grad():
@@ -184,6 +190,42 @@ def test_bodies_cross_the_seam_of_a_periodic_domain() -> None:
     assert float(there.pos[:, 0].min()) < 0.1 and float(there.pos[:, 0].max()) > 0.9
     moved, at_end = step(simulated, there)
     assert_close((state.periodicity.shortest(moved - found[0] - offset) + found[0], at_end), found)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.5])
+def test_pairs_that_may_touch_are_those_of_different_bodies_within_reach(shift: float) -> None:
+    """Moved by half a period, bodies lie across the seam of the domain, and the pairs stay the same."""
+    simulated, state = simulator(periodic=(True, False)), bodies(num_bodies=2, walls=False)
+    periodicity = simulated.builder.metadata.periodicity
+    pos = periodicity.wrapped(state.pos + torch.tensor([shift, 0.0], dtype=torch.float64))
+    store = simulated.builder(replace(state, pos=pos, periodicity=periodicity))["elastomer"]
+    body = torch.from_numpy(connected_components(cell_graph(state))[1])
+    way = state.pos[:, None] - state.pos[None]
+    reach = min(REACH * scenes.SPACING, simulated.builder.scales.radius)
+    near = (way.norm(dim=2) < reach) & (body[:, None] != body[None])
+    found = store.touch_index.sort(dim=1).values
+    assert len(found) and {*map(tuple, found.tolist())} == {*map(tuple, torch.nonzero(near.triu()).tolist())}
+    first, second = store.touch_index.T
+    torch.testing.assert_close(store.touch, way[first, second].float())
+
+
+def cell_graph(state: State) -> Any:
+    """Sparse graph of the nodes that cells connect."""
+    assert state.cells is not None
+    cells = np.asarray(state.cells)
+    ends = cells.ravel(), np.roll(cells, 1, axis=1).ravel()
+    return coo_matrix((np.ones(cells.size), ends), shape=(state.num_nodes, state.num_nodes))
+
+
+def test_nodes_without_a_cell_are_attached_to_the_body_beside_them() -> None:
+    """The corner of a block has no cell. The best triangle attaches it, in the same way for its mirror image. A node far away stays loose."""
+    rest = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [2.0, 0.0], [2.0, 1.0], [9.0, 9.0]])
+    cells, body = np.array([[0, 1, 2], [1, 3, 2], [1, 4, 3]]), np.zeros(7, np.int64)
+    found = attaching_cells(rest, cells, body, 1.8)
+    assert sorted(map(sorted, found.tolist())) == [[3, 4, 5]]
+    mirror = attaching_cells(rest * [-1, 1], cells, body, 1.8)
+    assert found.tolist() == mirror.tolist()
+    assert not len(attaching_cells(rest, cells, np.array([0, 0, 0, 0, 0, 1, 0]), 1.8))
 
 
 def test_the_embedding_decides_whether_the_law_reads_the_parameter() -> None:
@@ -415,6 +457,23 @@ def test_nodes_stop_at_the_distance_of_walls(wall_distance: float, way: float) -
     graph["elastomer"].wall = torch.tensor([0.0, 1.0, 1.2 * scenes.SPACING, 0.0]).expand(len(state.pos), 4)
     change = simulated(graph).acceleration["elastomer"][:, 1] * ACCELERATION * DT**2  # of the way over a frame
     torch.testing.assert_close(change / scenes.SPACING, torch.full_like(change, way + 0.5), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("friction", "expected"), [(0.2, 0.2 / (1 + 0.2 / 0.7)), (1e6, 0.7)])
+@pytest.mark.parametrize("plain", [False, True], ids=["compiled", "plain"])
+def test_the_layer_of_a_wall_limits_its_friction(friction: float, expected: float, plain: bool) -> None:
+    """The layer slows the fall of a block that slides over a wall, and friction takes that fraction of this impulse from the sliding."""
+    simulated, state = simulator(network=0.0, wall_layer=2.0), bodies(kind="lattice", walls=False)
+    assert state.rest_pos is not None
+    vel = torch.tensor([3.0, -0.1], dtype=torch.float64).expand_as(state.pos) * scenes.SPACING / DT
+    start = replace(state, pos=state.rest_pos, vel=vel, velocity_history=vel[:, None], frame_velocity=vel, gravity=0 * state.gravity)
+    graph = simulated.builder(start)
+    graph["elastomer"].wall = torch.tensor([0.0, 1.0, 1.0 * scenes.SPACING, friction]).expand(len(state.pos), 4)
+    with torch.no_grad(), unfused() if plain else nullcontext():
+        change = simulated(graph).frame_velocity["elastomer"] - vel * DT
+    sideways, upwards = (graph["elastomer"].mass.double()[:, None] * change).sum(dim=0).tolist()
+    assert upwards > 0.1 * scenes.SPACING
+    assert -sideways / upwards == pytest.approx(expected, rel=1e-3)
 
 
 def test_nodes_without_cells_keep_the_mean_velocities_of_free_flight() -> None:

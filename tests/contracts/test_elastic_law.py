@@ -86,9 +86,9 @@ def test_without_viscosity_its_constant_stays_negligible() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("modulus", [3e4, 1.3e5])
+@pytest.mark.parametrize("modulus", [3e4, 1.3e5, 6e5])
 def test_with_the_solvers_constants_a_block_bounces_as_in_the_material_point_method(modulus: float) -> None:
-    """Cells alone bend rightly; the layer of the wall, of the body's own stiffness, makes the bounce. Without it, blocks bounce a third lower."""
+    """The layer of the wall, with about half the body's stiffness, makes the bounce. Without it, blocks bounce a third lower, and stiff ones ring."""
     spec = dataset("data=elastomer", "size=small")
     solver, spacing, history, num_frames = cast(MPM, spec.solver), spec.scene.spacing, 1, 80
     start = scenes.dropped_block(spec, modulus, 12, 10, 0.1, 2.0)
@@ -100,13 +100,13 @@ def test_with_the_solvers_constants_a_block_bounces_as_in_the_material_point_met
     mass = mass.double() / mass.double().mean()
     cells = Cells.of(nodes.long(), rest.double(), mass, None)
     lam, mu = (value / unit for value in lame_parameters(modulus, solver.elastomer.poisson_ratio))
-    viscosity = 0.05 * spacing * math.sqrt(modulus * solver.elastomer.density) / (unit * dt)
+    viscosity = 0.02 * spacing * math.sqrt(modulus * solver.elastomer.density) / (unit * dt)
     law = tuple(torch.full((len(nodes),), value, dtype=torch.float64) for value in (lam, mu, viscosity))
     normal = torch.zeros_like(rest, dtype=torch.float64)
     normal[:, 1] = 1.0
-    stiffness = (lam + 2.0 * mu) / 1.5
+    stiffness = 0.55 * (lam + 2.0 * mu) / 2.3
     bounces = {}
-    for name, layer in {"layer": [1.5 * spacing, stiffness, 0.2 * math.sqrt(stiffness)], "plane": [0.0, 0.0, 0.0]}.items():
+    for name, layer in {"layer": [2.3 * spacing, stiffness, 0.25 * math.sqrt(stiffness)], "plane": [0.0, 0.0, 0.0]}.items():
         pos, vel = torch.from_numpy(truth.pos[0].astype(np.float64)), dt * first.double()
         gravity = torch.tensor([0.0, -9.81 * dt**2], dtype=torch.float64).expand_as(pos)
         path = [pos]

@@ -78,7 +78,7 @@ def test_a_law_sets_model_graph_and_training_together(data: str, model: str, law
     assert is_elastic or cfg.training.push_fraction > 0
     of_grid = (data, model, law) == ("elastomer", "gpe_tuned", "elastic")
     assert (cfg.training.loss, cfg.model.wall_layer, cfg.model.only_contacts, cfg.model.viscous) == (
-        ("log", 1.5, True, False) if of_grid else ("square", 0.0, False, True)
+        ("log", 2.0, True, False) if of_grid else ("square", 0.0, False, True)
     )
 
 
