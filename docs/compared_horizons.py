@@ -1,0 +1,62 @@
+"""Compares models by metric and horizon, over the same scenes: the table ``horizons.md`` of a folder in ``docs/results``.
+
+``python docs/compared_horizons.py TARGET METRICS FIRST OTHER…`` takes folders in which ``python -m gpe_pl.evaluate`` evaluated models, and METRICS such as
+``rollout_mse,deformation_error``. It writes the mean of each model, and the ratio of each OTHER to FIRST with its 95 % bootstrap interval over scenes.
+Columns are named after the folders.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.evaluation.horizons import FULL, time_of
+from gpe_pl.evaluation.metric_rows import LEARNED, read_rows
+from gpe_pl.files.atomic import replace_text
+from gpe_pl.files.markdown import table_row
+from gpe_pl.metrics import bootstrap_ratio
+
+CAPTION = "Mean over scenes of the values up to a horizon, and in brackets the 95 % bootstrap interval over the same scenes of the ratio to the first model."
+
+
+def values_of(folder: Path) -> dict[tuple[str, str], dict[int, float]]:
+    """Return the values of the learned model by metric and horizon, and then by scene."""
+    found: dict[tuple[str, str], dict[int, float]] = {}
+    for row in read_rows(folder / "metrics.csv"):
+        if row.model == LEARNED and row.trajectory >= 0:
+            found.setdefault((row.metric, row.horizon), {})[row.trajectory] = row.value
+    return found
+
+
+def table(metrics: list[str], folders: list[Path]) -> str:
+    """Return the table in Markdown.
+
+    Raises:
+        ValueError: a folder lacks a metric.
+    """
+    own = [values_of(folder) for folder in folders]
+    columns = ["metric", "up to", "scenes", folders[0].name]
+    columns += [text for folder in folders[1:] for text in (folder.name, f"{folder.name} / {folders[0].name}")]
+    lines = [table_row(columns), "|" + "---|" * len(columns)]
+    for metric in metrics:
+        horizons = sorted((h for m, h in own[0] if m == metric), key=lambda h: math.inf if h == FULL else time_of(h))
+        if not horizons:
+            raise ValueError(f"{folders[0]}: has no metric {metric}")
+        for horizon in horizons:
+            at = [values.get((metric, horizon), {}) for values in own]
+            scenes = sorted(set(at[0]).intersection(*at[1:]))
+            arrays = [np.array([[values[k] for k in scenes]]) for values in at]
+            cells = [metric, horizon, str(len(scenes)), f"{arrays[0].mean():.3g}"]
+            for array in arrays[1:]:
+                ratio = bootstrap_ratio(array, arrays[0], np.mean)
+                cells += [f"{array.mean():.3g}", f"{ratio.estimate:.2f} [{ratio.low:.2f}, {ratio.high:.2f}]"]
+            lines.append(table_row(cells))
+    return "\n".join([*lines, "", CAPTION]) + "\n"
+
+
+if __name__ == "__main__":
+    target, metrics, *folders = sys.argv[1:]
+    replace_text(Path(target) / "horizons.md", table(metrics.split(","), [*map(Path, folders)]))
