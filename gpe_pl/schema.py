@@ -112,6 +112,8 @@ BOUNDARY = "boundary"
 NODE_TYPES: tuple[str, ...] = (*MATERIALS, BOUNDARY)
 RADIUS, CELL, SAME, DOWN = "radius", "cell", "same", "down"
 """Relations: within a radius; in one mesh cell; neighbouring virtual nodes of one level; from a virtual node to its children (``up`` is the reverse)."""
+TOUCH_REACH = 5.0
+"""Largest distance in rest spacings of nodes of different bodies that may touch within a frame. A smaller radius of the graph limits it."""
 
 EdgeType = tuple[str, str, str]
 """``(source node type, relation, target node type)``."""

@@ -79,9 +79,10 @@ class GraphBuilder:
     - ``wall``: normal, distance [m] and friction of the plane of the nearest wall [node, dim + 2]; zero without a wall within the radius
     - ``corner_index`` [pair, 2] and ``corner`` [pair, dim + 1], for each pair of an edge of a body and a nearby corner of an obstacle: the nodes at the ends of
       the edge; the vector from the first of them to the corner [m] and the friction of the corner. Empty in 3D
-    - ``touch_index`` and ``touch``: pairs of nodes of different bodies within ``elastic_cells.REACH`` and the radius [pair, 2], and the vector from the second
+    - ``touch_index`` and ``touch``: pairs of nodes of different bodies within ``schema.TOUCH_REACH`` and the radius [pair, 2], and the vector from the second
       to the first [pair, dim] in m
     - ``cell_index``: corners of each cell [cell, 2^dim]; simplices repeat the last one
+    - ``attached_index``: the same for cells that attach nodes without a cell to the body beside them, for simplices outside of periodic domains
 
     In data sets with loads, nodes of materials also have ``prescribed`` [node] and ``load`` [node, dim] (see ``load_features``).
 

@@ -28,15 +28,14 @@ from gpe_pl.graphs.contacts import (
 from gpe_pl.graphs.features import Scales, from_centre
 from gpe_pl.graphs.search import as_array
 from gpe_pl.graphs.topology import GraphError, Topology
-from gpe_pl.schema import BOUNDARY, RADIUS, FeatureSpec
+from gpe_pl.schema import BOUNDARY, RADIUS, TOUCH_REACH, FeatureSpec
 from gpe_pl.trajectory.boundary import as_numpy
 from gpe_pl.trajectory.state import State
 
 NO_EDGES = np.empty((0, 2), np.int64)
-ATTACHED, FLATTEST = 1.8, 0.1
-"""Distance in rest spacings of the nodes to which loose nodes are attached, and least volume of such a cell over that of a box of its longest edge."""
-REACH = 5.0
-"""Largest distance in rest spacings of nodes of different bodies that may touch within a frame. A smaller radius of the graph limits it."""
+ATTACHED, FLATTEST, MOST_NEAR = 1.8, 0.1, 40
+"""Distance in rest spacings of the nodes to which loose nodes are attached, least volume of such a cell over that of a box of its longest edge, and the number
+of nearest nodes that are tried."""
 
 
 def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureSpec, scales: Scales, precision: torch.dtype) -> None:
@@ -61,8 +60,9 @@ def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureS
     for material in spec.meshes:
         at_rest = _at_rest(topology, state, material, dim, precision, scales.spacing)
         entries = (_entries_in_compiled_loops if compiled else _entries)(topology, state, material, at_rest, scales, precision)
-        touching = _touching(topology, state, material, REACH * scales.spacing, precision)
-        data[material].update({"cell_index": at_rest.cell_index, "rest_pos": at_rest.pos, **entries, **touching})
+        touching = _touching(topology, state, material, TOUCH_REACH * scales.spacing, precision)
+        own = {"cell_index": at_rest.cell_index, "attached_index": at_rest.attached_index, "rest_pos": at_rest.pos}
+        data[material].update({**own, **entries, **touching})
 
 
 def _touching(topology: Topology, state: State, material: str, reach: float, precision: torch.dtype) -> dict[str, Tensor]:
@@ -149,13 +149,15 @@ class _AtRest:
 
     Attributes:
         pos: undeformed positions relative to the mean of the body [node, dim] in m; zero without cells.
-        cell_index: corners of each cell [cell, 2^dim], with those that attach loose nodes.
+        cell_index: corners of each cell [cell, 2^dim].
+        attached_index: the same for the cells that attach loose nodes.
         surface: nodes of the edges at the surface of bodies in 2D, the body on the left [edge, 2]; empty in 3D.
         dtype: precision of the entries.
     """
 
     pos: Tensor
     cell_index: Tensor
+    attached_index: Tensor
     surface: np.ndarray
     dtype: Any
 
@@ -171,19 +173,18 @@ def _at_rest(topology: Topology, state: State, material: str, dim: int, precisio
     dtype = np.dtype(str(precision).removeprefix("torch."))
     if mesh is None or islands is None or state.cells is None or not len(rows):
         no_cells = torch.empty(0, 2**dim, dtype=torch.int64, device=device)
-        return _AtRest(torch.zeros(len(rows), dim, dtype=precision, device=device), no_cells, NO_EDGES, dtype)
+        return _AtRest(torch.zeros(len(rows), dim, dtype=precision, device=device), no_cells, no_cells, NO_EDGES, dtype)
 
     def make() -> _AtRest:
         cells, rest = _cells(state, rows, material, dim), mesh.rest_pos[rows]
         padding = cells[:, -1:].expand(-1, 2**dim - cells.shape[1])
         surface = oriented_edges(rest, cells) if dim == 2 else NO_EDGES
         centred = from_centre(rest, islands.body[material], islands.num_bodies).to(precision)
-        every = torch.cat([cells, padding], dim=1)
-        if cells.shape[1] == dim + 1:
-            more = attaching_cells(as_numpy(rest), as_numpy(cells), as_numpy(islands.body[material]), ATTACHED * spacing)
-            more = np.concatenate([more, more[:, -1:].repeat(every.shape[1] - dim - 1, axis=1)], axis=1)
-            every = torch.cat([every, torch.from_numpy(more).to(device)])
-        return _AtRest(centred, every, surface, dtype)
+        attached = cells.new_empty(0, 2**dim)
+        if cells.shape[1] == dim + 1 and not topology.periodicity:
+            found = attaching_cells(as_numpy(rest), as_numpy(cells), as_numpy(islands.body[material]), ATTACHED * spacing)
+            attached = torch.from_numpy(np.concatenate([found, found[:, -1:].repeat(2**dim - dim - 1, axis=1)], axis=1)).to(device)
+        return _AtRest(centred, torch.cat([cells, padding], dim=1), attached, surface, dtype)
 
     kept: dict[Any, _AtRest] = mesh.__dict__.setdefault("_cells_at_rest", {})  # not a field, so neither compared nor stored
     key = material, state.cell_dim, precision
@@ -206,6 +207,7 @@ def attaching_cells(
     for node in np.nonzero(~in_cells & (body >= 0))[0]:
         distance = np.linalg.norm(rest_pos[own] - rest_pos[node], axis=1)
         near = own[(distance < reach) & (body[own] == body[node])]
+        near = near[np.argsort(np.linalg.norm(rest_pos[near] - rest_pos[node], axis=1), kind="stable")[:MOST_NEAR]]
         choices = np.array([*combinations(near.tolist(), dim)], dtype=np.int64).reshape(-1, dim)
         edges = rest_pos[choices] - rest_pos[node]
         quality = np.abs(np.linalg.det(edges)) / np.linalg.norm(edges, axis=2).max(axis=1, initial=1e-300) ** dim

@@ -25,7 +25,7 @@ MAX_CACHED = 64
 """Largest number of graphs whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
 FIRST_STIFFNESS, FIRST_DAMPING, FIRST_MOST_FRICTION = 0.5, 0.1, 0.7
 """Stiffness, damping and largest friction of the layer of walls before training; the damping is a fraction of the critical one."""
-ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "cell_index", "corner_index", "corner")
+ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "cell_index", "attached_index", "corner_index", "corner")
 """Entries of a material's store that the law reads."""
 
 
@@ -182,7 +182,7 @@ class ElasticBodies(nn.Module):
         body_pos, (mean, velocity) = store["body_pos"], store["velocity"].double().split(self.dim, dim=1)
         gravity = data.gravity.to(device).double()
         gravity = gravity if scene is None else gravity[scene]
-        cells = cells_at_rest(m, store["cell_index"], store["rest_pos"], mass.to(device), scene)
+        cells = cells_at_rest(m, _with_attached(store, scene), store["rest_pos"], mass.to(device), scene)
         # masses are in units of their mean, and the rest volume of a node is about spacing^dim
         modulus = spacing ** (2 - self.dim)
         of_node = [value.to(device) for value in constants]
@@ -221,7 +221,7 @@ class ElasticBodies(nn.Module):
         store = data[m]
         host = {key: store[key].cpu() for key in ENTRIES}
         mass_on_host, scene = mass.cpu(), store.batch.cpu() if "batch" in store else None
-        cells = cells_at_rest(m, host["cell_index"], host["rest_pos"], mass_on_host, scene)
+        cells = cells_at_rest(m, _with_attached(host, scene), host["rest_pos"], mass_on_host, scene)
         law = cast(Constants, self.constants[m]).logarithm
         units = [self.acceleration_unit, self.spacing, self.stress_unit, self.log_friction[m].exp(), self.wall_distance[m] * self.spacing]
         thickness, *others = cast(WallLayer, self.wall_layer[m]).values()
@@ -243,6 +243,14 @@ class ElasticBodies(nn.Module):
         )  # fmt: skip
         found, velocity, tensions = (torch.from_numpy(a).to(mass.device) for a in (moved, at_end, stress))
         return found, velocity, tensions if with_stress else None
+
+
+def _with_attached(store: dict[str, Tensor], scene: Tensor | None) -> Tensor:
+    """Return the cells of a material with those that attach loose nodes, scene by scene."""
+    if not len(store["attached_index"]):
+        return store["cell_index"]
+    cells = torch.cat([store["cell_index"], store["attached_index"]])
+    return cells if scene is None else cells[torch.argsort(scene[cells[:, 0]], stable=True)]
 
 
 def _array(x: Tensor) -> np.ndarray:

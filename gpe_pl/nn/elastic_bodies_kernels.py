@@ -64,6 +64,8 @@ def move_bodies(
                 forcing[n, a], weights[n, a] = acceleration[n, a] * acceleration_unit + gravity[s, a], mass[n]
                 if len(held) and held[n, a]:
                     forcing[n, a], weights[n, a] = 0.0, HEAVY
+            if len(held) and held[n].any():
+                normal[n] = 0.0  # walls do not move a held node
     point, point_friction = np.empty((len(corner), dim)), np.empty(len(corner))
     for k in range(len(corner)):
         coefficient = corner[k, dim] * friction_factor
@@ -82,7 +84,7 @@ def move_bodies(
             layer[n, 0], layer[n, 1] = thickness, min(stiffness, 0.5 * float(number[s]) ** 2)
             layer[n, 2] = min(layer_damping * math.sqrt(stiffness), 0.5 * number[s])
     pair_start, touch_start = _first_of_scenes(corner_index, node_start), _first_of_scenes(touching, node_start)
-    soften_touching(touching, way, touch, mass, number, node_start, touch_start, limits[2], limits[3])
+    soften_touching(touching, way, touch, mass, vel, number, node_start, touch_start, limits[2], limits[3])
     path, speed_path, pushed = np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim))
     contacts = np.zeros((KEPT, len(corner), 6))
     move_forward(

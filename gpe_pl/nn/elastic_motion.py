@@ -210,14 +210,15 @@ def elastic_motion(
     if corners is None:
         corners = Corners(cells.nodes.new_empty(0, 2), pos.new_empty(0, pos.shape[1]), pos.new_empty(0))
     softened, number = _softened_law(pos, law, cells)
-    axis_mass = mass.double()[:, None].expand_as(pos)
+    axis_mass, normal = mass.double()[:, None].expand_as(pos), walls.normal
     if held is not None:
         forcing, axis_mass = torch.where(held, 0.0, forcing), torch.where(held, HEAVY, axis_mass)
+        normal = torch.where(held.any(dim=1, keepdim=True), 0.0, normal)  # walls do not move a held node
     gap = walls.gap.clamp(min=0.0)  # a node behind a plane is not pushed out at once
     layer = pos.new_zeros(len(pos), 3) if walls.layer is None else _stable_layer(walls.layer, number, cells)
     of_node = number.repeat_interleave(cells.node_start.diff(), output_size=len(pos))
-    touching = (touching or Touching.nothing(pos)).softened(mass.double(), of_node)
-    contacts = (walls.normal, gap, walls.friction, layer, corners.point, corners.friction, touching.way, touching.law)
+    touching = (touching or Touching.nothing(pos)).softened(mass.double(), of_node, vel.double())
+    contacts = (normal, gap, walls.friction, layer, corners.point, corners.friction, touching.way, touching.law)
     values = [t.double() for t in (pos, vel, forcing, axis_mass, *softened, *contacts)]
     move: Any = _Motion.apply if works_on(*values) else plain_motion
     displacement, velocity = move(*values, corners.nodes, touching.nodes, cells, number)

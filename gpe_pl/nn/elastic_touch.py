@@ -1,4 +1,4 @@
-"""Contact between elastic bodies within a frame: forces between the nodes of different bodies, with constants that a network learns.
+"""Contact between elastic bodies of one material within a frame: forces between their nodes, with constants that a network learns.
 
 Two nodes whose distance r is below the thickness D of the layer, at a depth ``δ = 1 − r/D``, act on each other with the force::
 
@@ -17,10 +17,15 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
+from gpe_pl.nn.elastic_touch_kernels import CLOSEST
+from gpe_pl.schema import TOUCH_REACH
+
 SHARE = 0.5
 """Largest squared frequency and rate of damping by contacts, as fractions of the squared number of substeps and of this number. Both are softened above."""
 APPROACH = 1.0 / 3.0
-"""Distance by which nodes may approach within a frame, as a fraction of the thickness, for the estimate of these rates."""
+"""Least distance by which nodes are taken to approach within a frame, as a fraction of the thickness, for the estimate of these rates."""
+MOST_ADHESION = 0.9
+"""With an adhesion of 1, nodes would attract each other at any depth."""
 FIRST = (0.1, 0.05, 1.0, 1.0)
 """Stiffness, adhesion and damping of approach and of sliding before training; the damping is a fraction of the critical one."""
 
@@ -44,18 +49,21 @@ class Touching:
         """Return no pairs, for nodes at ``pos``."""
         return cls(torch.empty(0, 2, dtype=torch.int64, device=pos.device), pos.new_empty(0, pos.shape[1]), pos.new_empty(0, 5))
 
-    def softened(self, mass: Float[Tensor, " node"], number: Int64[Tensor, " node"]) -> Touching:
+    def softened(self, mass: Float[Tensor, " node"], number: Int64[Tensor, " node"], velocity: Float[Tensor, "node dim"]) -> Touching:
         """Return the same pairs, softened where the substeps would be too long for the contacts of a node.
 
         Args:
             mass: masses of the nodes.
             number: number of substeps in the scene of each node.
+            velocity: velocities at the start of the frame [m/frame].
         """
         if not len(self.nodes):
             return self
-        thickness, stiffness, _, approach, sliding = self.law.unbind(dim=1)
-        depth = (1.0 + APPROACH - self.way.norm(dim=1) / thickness).clamp(0.0, 1.0)
-        softer = self._least(SHARE * number.double() ** 2 * mass, 4.0 * stiffness * depth)
+        thickness, stiffness, adhesion, approach, sliding = self.law.unbind(dim=1)
+        distance = torch.maximum(self.way.norm(dim=1), CLOSEST * thickness)
+        closing = -((velocity[self.nodes[:, 0]] - velocity[self.nodes[:, 1]]) * self.way).sum(dim=1) / (distance * thickness)
+        depth = (1.0 + closing.clamp(min=APPROACH) - distance / thickness).clamp(0.0, 1.0)
+        softer = self._least(SHARE * number.double() ** 2 * mass, stiffness * (4.0 * depth + torch.where(depth > 0, 2.0 * adhesion, 0.0)))
         less = self._least(SHARE * number.double() * mass, 2.0 * torch.maximum(approach, sliding) * depth)
         one = torch.ones_like(softer)
         return Touching(self.nodes, self.way, self.law * torch.stack([one, softer, one, less, less], dim=1))
@@ -79,7 +87,7 @@ def touching_forces(moved: Float[Tensor, "node dim"], velocity: Float[Tensor, "n
     thickness, stiffness, adhesion, approach, sliding = touching.law.T[:, :, None]
     x = touching.way + moved[first] - moved[second]
     w = velocity[first] - velocity[second]
-    distance = x.norm(dim=1, keepdim=True)
+    distance = torch.maximum(x.square().sum(dim=1, keepdim=True), (CLOSEST * thickness) ** 2).sqrt()
     depth = (1.0 - distance / thickness).clamp(min=0.0)
     n = x / distance
     along = (w * n).sum(dim=1, keepdim=True)
@@ -92,7 +100,7 @@ class BodyLayer(nn.Module):
     """Learned layer between bodies of a material. Its thickness is one value; the logarithms of the other constants are affine in the material parameters.
 
     Args:
-        thickness: thickness before training, in rest spacings; 0 stands for no layer, which is not learned.
+        thickness: thickness before training, in rest spacings; 0 stands for no layer, which is not learned. It stays at most ``schema.TOUCH_REACH``.
         param_channels: number of material parameters.
         scale: factor of the logarithms, so that training finds them within some hundred steps.
     """
@@ -119,7 +127,7 @@ class BodyLayer(nn.Module):
         """
         logarithm = self.scale * nn.functional.linear(params, self.logarithm["weight"].to(params), self.logarithm["bias"].to(params))
         factor, adhesion, approach, sliding = logarithm.clamp(-20.0, 20.0).exp()[nodes].mean(dim=1).double().unbind(dim=1)
-        thickness = self.log_thickness.exp().to(factor)
+        thickness, adhesion = self.log_thickness.exp().clamp(max=TOUCH_REACH).to(factor), adhesion.clamp(max=MOST_ADHESION)
         stiffness = factor * modulus[nodes].mean(dim=1).double() / thickness
         critical = 2.0 * stiffness.sqrt()
         return torch.stack([(thickness * spacing).expand_as(factor), stiffness, adhesion, approach * critical, sliding * critical], dim=1)

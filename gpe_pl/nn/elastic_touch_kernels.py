@@ -8,6 +8,9 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+CLOSEST = 1e-9
+"""Least distance of two nodes, as a fraction of the thickness, that has a direction."""
+
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
@@ -21,7 +24,7 @@ def add_touching_forces(y, pos, velocity, nodes, way, law, first, end, force):
             x = way[p, i] + (y[a, i] - pos[a, i]) - (y[b, i] - pos[b, i])
             square += x * x
             along += x * (velocity[a, i] - velocity[b, i])
-        distance = math.sqrt(square)
+        distance = max(math.sqrt(square), CLOSEST * thickness)
         depth = 1.0 - distance / thickness
         if depth <= 0.0:
             continue
@@ -47,7 +50,7 @@ def pull_back_touching(y, pos, velocity, per_mass, nodes, way, law, first, end, 
             x[i] = way[p, i] + (y[a, i] - pos[a, i]) - (y[b, i] - pos[b, i])
             w[i], g[i] = velocity[a, i] - velocity[b, i], per_mass[a, i] - per_mass[b, i]
             square += x[i] * x[i]
-        distance = math.sqrt(square)
+        distance = max(math.sqrt(square), CLOSEST * thickness)
         depth = 1.0 - distance / thickness
         if depth <= 0.0:
             continue
@@ -81,16 +84,19 @@ def pull_back_touching(y, pos, velocity, per_mass, nodes, way, law, first, end, 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def soften_touching(nodes, way, law, mass, number, node_start, touch_start, share, approach):
+def soften_touching(nodes, way, law, mass, vel, number, node_start, touch_start, share, approach):
     """Soften pairs in place, as ``elastic_touch.Touching.softened`` does. ``share`` and ``approach`` are its constants."""
     total = np.zeros((mass.shape[0], 2))
     for p in range(nodes.shape[0]):
-        square = 0.0
+        square, closing = 0.0, 0.0
         for i in range(way.shape[1]):
             square += way[p, i] ** 2
-        depth = min(max(1.0 + approach - math.sqrt(square) / law[p, 0], 0.0), 1.0)
+            closing -= (vel[nodes[p, 0], i] - vel[nodes[p, 1], i]) * way[p, i]
+        distance = max(math.sqrt(square), CLOSEST * law[p, 0])
+        depth = min(max(1.0 + max(closing / (distance * law[p, 0]), approach) - distance / law[p, 0], 0.0), 1.0)
+        adhesion = 2.0 * law[p, 2] if depth > 0.0 else 0.0
         for end in range(2):
-            total[nodes[p, end], 0] += 4.0 * law[p, 1] * depth
+            total[nodes[p, end], 0] += law[p, 1] * (4.0 * depth + adhesion)
             total[nodes[p, end], 1] += 2.0 * max(law[p, 3], law[p, 4]) * depth
     for s in range(len(number)):
         for p in range(touch_start[s], touch_start[s + 1]):

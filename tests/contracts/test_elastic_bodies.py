@@ -21,7 +21,7 @@ from gpe_pl.geometry.shape_values import moved as moved_shape
 from gpe_pl.geometry.shapes import Box, domain_walls
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
-from gpe_pl.graphs.elastic_cells import REACH, attaching_cells
+from gpe_pl.graphs.elastic_cells import attaching_cells
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.approximate import Repeating, Sleeping
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -31,7 +31,7 @@ from gpe_pl.nn.elastic_motion import Cells
 from gpe_pl.rollout.containment import contain
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.schema import node_code
+from gpe_pl.schema import TOUCH_REACH, node_code
 from gpe_pl.system.compiled import unfused
 from gpe_pl.training.push_forward import MOVED, _moved
 from gpe_pl.trajectory.boundary import Boundary
@@ -192,17 +192,20 @@ def test_bodies_cross_the_seam_of_a_periodic_domain() -> None:
     assert_close((state.periodicity.shortest(moved - found[0] - offset) + found[0], at_end), found)
 
 
+@pytest.mark.parametrize("radius", [2.4, 7.0])
 @pytest.mark.parametrize("shift", [0.0, 0.5])
-def test_pairs_that_may_touch_are_those_of_different_bodies_within_reach(shift: float) -> None:
+def test_pairs_that_may_touch_are_those_of_different_bodies_within_reach(shift: float, radius: float) -> None:
     """Moved by half a period, bodies lie across the seam of the domain, and the pairs stay the same."""
-    simulated, state = simulator(periodic=(True, False)), bodies(num_bodies=2, walls=False)
-    periodicity = simulated.builder.metadata.periodicity
+    build = scenes.builder(BODIES, 2, mesh=True, cells=True, connectivity_spacings=radius)
+    build = GraphBuilder(build.config, replace(build.metadata, periodic=(True, False)))
+    state, periodicity = bodies(num_bodies=2, walls=False), build.metadata.periodicity
     pos = periodicity.wrapped(state.pos + torch.tensor([shift, 0.0], dtype=torch.float64))
-    store = simulated.builder(replace(state, pos=pos, periodicity=periodicity))["elastomer"]
+    store = build(replace(state, pos=pos, periodicity=periodicity))["elastomer"]
     body = torch.from_numpy(connected_components(cell_graph(state))[1])
     way = state.pos[:, None] - state.pos[None]
-    reach = min(REACH * scenes.SPACING, simulated.builder.scales.radius)
-    near = (way.norm(dim=2) < reach) & (body[:, None] != body[None])
+    apart, reach = way.norm(dim=2) / scenes.SPACING, min(TOUCH_REACH, radius)
+    near = (apart < reach) & (body[:, None] != body[None])
+    assert bool(((apart > reach) & (apart < max(radius, reach + 1)) & (body[:, None] != body[None])).any())
     found = store.touch_index.sort(dim=1).values
     assert len(found) and {*map(tuple, found.tolist())} == {*map(tuple, torch.nonzero(near.triu()).tolist())}
     first, second = store.touch_index.T
@@ -226,6 +229,35 @@ def test_nodes_without_a_cell_are_attached_to_the_body_beside_them() -> None:
     mirror = attaching_cells(rest * [-1, 1], cells, body, 1.8)
     assert found.tolist() == mirror.tolist()
     assert not len(attaching_cells(rest, cells, np.array([0, 0, 0, 0, 0, 1, 0]), 1.8))
+
+
+def test_a_node_without_a_cell_stays_with_its_body() -> None:
+    """A body that was stretched springs back, and its loose corner with it, alone and in a batch. Cells in graphs stay those of the mesh."""
+    simulated, state = simulator(network=0.0), bodies(walls=False)
+    assert state.cells is not None
+    corner = int(state.pos.sum(dim=1).argmin())
+    loose = replace(state, cells=state.cells[~(state.cells == corner).any(dim=1)])
+    store = simulated.builder(loose)["elastomer"]
+    assert set(store.attached_index[:, 0].tolist()) >= {corner} and len(store.cell_index) == len(loose.cells)  # type: ignore[arg-type]
+    pulled = loose.pos.clone()
+    pulled[corner] -= 0.5 * scenes.SPACING
+    still = 0.0 * state.pos
+    start = replace(loose, pos=pulled, vel=still, velocity_history=still[:, None], frame_velocity=still, gravity=0.0 * state.gravity)
+    after = simulated.step(start)
+    assert float((after.pos - pulled)[corner].min()) > 0.01 * scenes.SPACING
+    for alone, other in zip((start, state), simulated.step_all([start, state]), strict=True):
+        assert isinstance(other, State) and other.frame_velocity is not None
+        assert_close((other.pos, other.frame_velocity), step(simulated, alone))
+
+
+@pytest.mark.parametrize("plain", [False, True], ids=["compiled", "plain"])
+def test_bodies_with_coincident_nodes_move_finitely(plain: bool) -> None:
+    simulated, state = simulator(network=0.0, body_layer=3.0), bodies(num_bodies=2, walls=False)
+    body = torch.from_numpy(connected_components(cell_graph(state))[1])
+    pos = state.pos.clone()
+    pos[body == 1] += pos[body == 0][0] - pos[body == 1][0]
+    with unfused() if plain else nullcontext():
+        assert bool(simulated.step(replace(state, pos=pos)).pos.isfinite().all())
 
 
 def test_the_embedding_decides_whether_the_law_reads_the_parameter() -> None:

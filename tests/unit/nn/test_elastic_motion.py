@@ -406,3 +406,16 @@ def test_a_torn_cell_carries_no_forces(kind: str, plain: bool) -> None:
     assert float((pulled - near)[0].norm()) > 0.05 * SPACING
     torch.testing.assert_close(torn, far, rtol=0, atol=1e-9 * SPACING)
     assert not bool((vel.abs() > 1e-9 * SPACING).any())
+
+
+@pytest.mark.parametrize("plain", [False, True], ids=["compiled", "plain"])
+def test_walls_do_not_move_held_nodes(plain: bool) -> None:
+    body = Body("triangles")
+    held = torch.zeros_like(body.rest, dtype=torch.bool)
+    held[:3] = True
+    still, layer = torch.zeros_like(body.rest), torch.tensor([SPACING, 1.0, 0.5]).double().expand(len(body.rest), 3)
+    walls = replace(floor(body.rest, height=float(body.rest[:, 1].min()) - 0.2 * SPACING), layer=layer)
+    with unfused() if plain else torch.enable_grad():
+        moved, vel, _ = elastic_motion(body.rest, still, still, body.mass, body.law, body.cells, walls, held=held)  # type: ignore[arg-type]
+    assert float(moved[:3].abs().max()) < 1e-6 * SPACING and float(vel[:3].abs().max()) < 1e-6 * SPACING
+    assert float(moved[3:].abs().max()) > 0.01 * SPACING
