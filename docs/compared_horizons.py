@@ -7,13 +7,12 @@ seeds. ``FOLDER,FOLDER`` are several seeds of one model. Columns are named after
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 
 import numpy as np
 
-from gpe_pl.evaluation.horizons import FULL, time_of
+from gpe_pl.evaluation.horizons import time_of
 from gpe_pl.evaluation.metric_rows import LEARNED, read_rows
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
@@ -42,7 +41,7 @@ def table(metrics: list[str], models: list[list[Path]]) -> str:
     columns = ["metric", "up to", "scenes", first, *(text for other in others for text in (other, f"{other} / {first}"))]
     lines = [table_row(columns), "|" + "---|" * len(columns)]
     for metric in metrics:
-        horizons = sorted((h for m, h in own[0][0] if m == metric), key=lambda h: math.inf if h == FULL else time_of(h))
+        horizons = sorted((h for m, h in own[0][0] if m == metric), key=time_of)
         if not horizons:
             raise ValueError(f"{models[0][0]}: has no metric {metric}")
         for horizon in horizons:

@@ -68,7 +68,7 @@ def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureS
 def _touching(topology: Topology, state: State, material: str, reach: float, precision: torch.dtype) -> dict[str, Tensor]:
     """Return the pairs of nodes of different bodies within ``reach`` and the radius, and the vector from the second to the first of each."""
     edges, rows = topology.edges.get((material, RADIUS, material)), topology.rows[material]
-    if edges is None or topology.islands is None or not topology.edges[material, RADIUS, material].shape[1]:
+    if edges is None or topology.islands is None or not edges.shape[1]:
         return {"touch_index": rows.new_empty(0, 2), "touch": state.pos.new_empty(0, state.pos.shape[1], dtype=precision)}
     body = topology.islands.body[material].to(rows.device)
     first, second = edges[:, body[edges[0]] != body[edges[1]]]
@@ -196,25 +196,25 @@ def _at_rest(topology: Topology, state: State, material: str, dim: int, precisio
 def attaching_cells(
     rest_pos: Float64[np.ndarray, "node dim"], cells: Int64[np.ndarray, "cell corner"], body: Int64[np.ndarray, " node"], reach: float
 ) -> Int64[np.ndarray, "more corner"]:
-    """Return simplices that attach nodes without a cell to the body beside them; without cells such nodes would fly away from it.
+    """Return simplices that attach nodes without a cell to the body beside them. Without cells such nodes would fly away from it.
 
-    Simplices have the loose node, and those nodes of cells of the same body within ``reach`` [m] that give the largest volume for the size. A node without
-    enough such neighbours stays loose.
+    A simplex joins a loose node with nodes of cells of the same body within ``reach`` [m]. Those with the largest volume for their size are taken. A node
+    without enough such neighbours stays loose.
     """
     dim, in_cells = rest_pos.shape[1], np.zeros(len(rest_pos), bool)
     in_cells[cells] = True
     own, found = np.nonzero(in_cells)[0], []
     for node in np.nonzero(~in_cells & (body >= 0))[0]:
         distance = np.linalg.norm(rest_pos[own] - rest_pos[node], axis=1)
-        near = own[(distance < reach) & (body[own] == body[node])]
-        near = near[np.argsort(np.linalg.norm(rest_pos[near] - rest_pos[node], axis=1), kind="stable")[:MOST_NEAR]]
+        distance[body[own] != body[node]] = np.inf
+        nearest = np.argsort(distance, kind="stable")[:MOST_NEAR]
+        near = own[nearest[distance[nearest] < reach]]
         choices = np.array([*combinations(near.tolist(), dim)], dtype=np.int64).reshape(-1, dim)
         edges = rest_pos[choices] - rest_pos[node]
         quality = np.abs(np.linalg.det(edges)) / np.linalg.norm(edges, axis=2).max(axis=1, initial=1e-300) ** dim
         best = max(quality.max(initial=0.0) * (1.0 - 1e-6), FLATTEST)
-        found += [
-            [node, *choice] for choice in choices[quality > best]
-        ]  # all of the best, so that neither numbers nor mirror images matter
+        # all of the best, so that the order of nodes does not matter, and mirror images are alike
+        found += [[node, *choice] for choice in choices[quality > best]]
     return np.array(found, dtype=np.int64).reshape(-1, dim + 1)
 
 

@@ -21,11 +21,12 @@ from gpe_pl.nn.elastic_touch_kernels import CLOSEST
 from gpe_pl.schema import TOUCH_REACH
 
 SHARE = 0.5
-"""Largest squared frequency and rate of damping by contacts, as fractions of the squared number of substeps and of this number. Both are softened above."""
+"""Contacts of a node are softened until their squared frequency is at most this fraction of the squared number of substeps, and their rate of damping at most
+this fraction of the number."""
 APPROACH = 1.0 / 3.0
 """Least distance by which nodes are taken to approach within a frame, as a fraction of the thickness, for the estimate of these rates."""
 MOST_ADHESION = 0.9
-"""With an adhesion of 1, nodes would attract each other at any depth."""
+"""Largest adhesion. With 1, nodes would attract each other at any depth."""
 FIRST = (0.1, 0.05, 1.0, 1.0)
 """Stiffness, adhesion and damping of approach and of sliding before training; the damping is a fraction of the critical one."""
 
