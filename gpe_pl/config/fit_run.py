@@ -89,11 +89,6 @@ class FitRun:
         self.graph = construct(GraphConfig, cfg.graph, "graph")
         self.parts = training_parts(cfg)
         self.stride, self.evaluated_stride = stride_of(self.parts[0]), stride_of(evaluated_config(cfg))
-        if (self.training.unroll_steps or 1) > 1 and self.graph.cells:
-            raise ConfigError(
-                f"training.unroll_steps={self.training.unroll_steps}: not together with graph.cells=true, whose contacts have no "
-                "gradients; choose training.unroll_steps=null"
-            )
         self.logger = construct(LoggerSettings, cfg.logger, "logger")
         settings = {key: value for key, value in cfg.model.items() if key != "_target_"}
         self.new_model = bind(model_class(cfg.model._target_), settings, "model", "spec")

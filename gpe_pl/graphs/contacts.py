@@ -80,7 +80,14 @@ def _nearest_shapes(pos: Tensor, shapes: Sequence[Shape], spacing: float) -> Ten
         own = nearest == number
         found[own, :-2] = outward_normal(shapes[number], points[own], NORMAL_STEP * spacing)
         found[own, -1] = min(shapes[number].friction, MOST_FRICTION)
-    return torch.from_numpy(found).to(pos.device)
+    wall = torch.from_numpy(found).to(pos.device)
+    along = (wall[:, :-2] * _displaced(pos)).sum(dim=1, keepdim=True)
+    return torch.cat([wall[:, :-2], wall[:, -2:-1] + along, wall[:, -1:]], dim=1)
+
+
+def _displaced(pos: Tensor) -> Tensor:
+    """Return zeros with the derivative of the positions, since distances from shapes are computed without one. Planes and corners stay where they are."""
+    return pos - pos.detach()
 
 
 def corners_near_edges(
@@ -105,7 +112,8 @@ def corners_near_edges(
     edge, which = np.nonzero(((middle[:, None] - point[None]) ** 2).sum(axis=2) < radius**2)
     ends = edges[edge]
     values = beside_first_node(where[ends[:, 0]], boundary, corner[which])
-    return torch.from_numpy(ends).to(pos.device), torch.from_numpy(values).to(pos)
+    nodes, corners = torch.from_numpy(ends).to(pos.device), torch.from_numpy(values).to(pos)
+    return nodes, torch.cat([corners[:, :2] - _displaced(pos)[nodes[:, 0]], corners[:, 2:]], dim=1)
 
 
 def beside_first_node(

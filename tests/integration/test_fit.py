@@ -158,7 +158,6 @@ def test_the_papers_recipe_trains_without_average_and_clipping(
     [
         (("training.unroll_steps=2",), r"^training: unroll_steps=2: not together with push_fraction=0.6; set push_fraction=0$"),
         (("training.unroll_steps=2", "training.targets=solver", *PLAIN), r"not together with targets=solver; set targets=trajectory$"),
-        (("training.unroll_steps=2", "graph.cells=true", *PLAIN), r"^training.unroll_steps=2: not together with graph.cells=true, "),
         (("training.unroll_steps=0",), r"^training.unroll_steps=0: "),
         (("training.neighbor_weight=-1",), r"^training.neighbor_weight=-1: "),
         (("training.loss=cube",), r"^training.loss='cube': "),
