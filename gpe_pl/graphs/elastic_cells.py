@@ -14,6 +14,8 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.geometry.compiled_distance import has_compiled_distance
 from gpe_pl.geometry.compiled_surfaces import write_nearest_surfaces
+from gpe_pl.geometry.relief import REACH, SOFT, reliefs
+from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.graphs import elastic_cells_kernels
 from gpe_pl.graphs.compiled_graph import NO_ROWS, works_on
 from gpe_pl.graphs.contacts import (
@@ -33,6 +35,10 @@ from gpe_pl.trajectory.boundary import as_numpy
 from gpe_pl.trajectory.state import State
 
 NO_EDGES = np.empty((0, 2), np.int64)
+PROBED = 1.5
+"""Largest distance from a wall at which its relief is computed, in rest spacings."""
+WITHOUT_RELIEF = ("wall", "bowl")
+"""Shapes that are nowhere sharper than a flat wall."""
 ATTACHED, FLATTEST, MOST_NEAR = 1.8, 0.1, 40
 """Distance in rest spacings of the nodes to which loose nodes are attached, least volume of such a cell over that of a box of its longest edge, and the number
 of nearest nodes that are tried."""
@@ -60,6 +66,7 @@ def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureS
     for material in spec.meshes:
         at_rest = _at_rest(topology, state, material, dim, precision, scales.spacing)
         entries = (_entries_in_compiled_loops if compiled else _entries)(topology, state, material, at_rest, scales, precision)
+        entries["relief"] = _reliefs(state, topology.rows[material], entries["wall"], scales.spacing)
         touching = _touching(topology, state, material, TOUCH_REACH * scales.spacing, precision)
         own = {"cell_index": at_rest.cell_index, "attached_index": at_rest.attached_index, "rest_pos": at_rest.pos}
         data[material].update({**own, **entries, **touching})
@@ -141,6 +148,27 @@ def _walls(topology: Topology, state: State, material: str, scales: Scales) -> T
     return nearest_walls(
         state.pos[topology.rows[material]], state.boundary, state.boundary.shapes, edges, scales.spacing, topology.periodicity
     )
+
+
+def _reliefs(state: State, rows: Tensor, wall: Tensor, spacing: float) -> Tensor:
+    """Return how much farther the wall of each node seems to be, because it is sharp or thin there [node] in m; see ``geometry.relief``.
+
+    Nodes farther than ``PROBED`` from a wall have the relief of the point in front of it at this distance, since they may reach it within the frame.
+    """
+    boundary, dim = state.boundary, state.pos.shape[1]
+    relief = wall.new_zeros(len(rows))
+    obstacles = boundary.made_once("obstacles", lambda: tuple(shape for shape in boundary.shapes if shape.kind not in WITHOUT_RELIEF))
+    if not obstacles:
+        return relief
+    pos, (normal, distance) = as_numpy(state.pos[rows]), np.split(as_numpy(wall[:, : dim + 1]).astype(float), [dim], axis=1)
+    beyond = np.maximum(distance - PROBED * spacing, 0.0)
+    near = (normal != 0).any(axis=1) & (distance[:, 0] < TOUCH_REACH * spacing)
+    points = pos[near] - beyond[near] * normal[near]
+    beside = signed_distance(obstacles, points) < (REACH + SOFT) * spacing  # farther away the kernel meets no obstacle
+    near[near] = beside
+    found = reliefs(boundary.shapes, points[beside], np.minimum(distance[near, 0], PROBED * spacing), spacing)
+    relief[torch.from_numpy(near).to(relief.device)] = torch.from_numpy(found).to(relief)
+    return relief
 
 
 @dataclass(frozen=True)

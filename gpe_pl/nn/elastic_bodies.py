@@ -25,7 +25,9 @@ MAX_CACHED = 64
 """Largest number of graphs whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
 FIRST_STIFFNESS, FIRST_DAMPING, FIRST_MOST_FRICTION = 0.5, 0.1, 0.7
 """Stiffness, damping and largest friction of the layer of walls before training; the damping is a fraction of the critical one."""
-ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "cell_index", "attached_index", "corner_index", "corner")
+THINNEST = 0.01
+"""Least thickness of the layer of walls, in rest spacings."""
+ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "relief", "cell_index", "attached_index", "corner_index", "corner")
 """Entries of a material's store that the law reads."""
 
 
@@ -51,7 +53,8 @@ class WallLayer(nn.Module):
     """Elastic layer of walls, of the material of the body that it touches: thickness, stiffness, damping and largest friction are learned.
 
     The material point method has such a layer. Its particles feel a wall as soon as they share a cell of the grid with it, and deform on their way to it. The
-    layer slips: bodies slide even on walls to which they should stick. So a friction μ acts as ``μ / (1 + μ/M)``, with the largest friction M.
+    layer slips: bodies slide even on walls to which they should stick. So a friction μ acts as ``μ / (1 + μ/M)``, with the largest friction M. The layer is
+    thinner where a solid is sharp or thin, by the relief of the solid, because the grid hardly sees it there (see ``geometry.relief``).
 
     Args:
         thickness: thickness before training, in rest spacings; 0 stands for no layer, which is not learned.
@@ -66,26 +69,27 @@ class WallLayer(nn.Module):
             self.log_damping = nn.Parameter(torch.tensor(FIRST_DAMPING).log())
             self.log_most_friction = nn.Parameter(torch.tensor(FIRST_MOST_FRICTION).log())
 
-    def values(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the thickness in rest spacings, the stiffness as a factor of λ + 2μ, the damping per square root of the stiffness, and 1/M."""
-        if not self.has_thickness:
-            nothing = torch.zeros(())
-            return nothing, nothing, nothing, nothing
-        return self.log_thickness.exp(), self.log_stiffness.exp(), 2.0 * self.log_damping.exp(), (-self.log_most_friction).exp()
+    def slipping(self, friction: Float[Tensor, " contact"]) -> Float[Tensor, " contact"]:
+        """Return the friction coefficients that act, of nodes or corners."""
+        return friction / (1.0 + friction * (-self.log_most_friction).exp().to(friction)) if self.has_thickness else friction
 
-    def of_nodes(self, modulus: Float[Tensor, " node"], mass: Float[Tensor, " node"], spacing: Tensor) -> Float[Tensor, "node 3"] | None:
+    def of_nodes(
+        self, relief: Float[Tensor, " node"], modulus: Float[Tensor, " node"], mass: Float[Tensor, " node"], spacing: Tensor
+    ) -> Float[Tensor, "node 3"] | None:
         """Return the layer of each node as ``elastic_motion.Walls`` has it; None without a layer.
 
         Args:
+            relief: relief of the nearest solid [m].
             modulus: λ + 2μ in units of mean mass × spacing^(2 - dim) per frame².
             mass: masses in units of their mean.
             spacing: rest spacing [m].
         """
         if not self.has_thickness:
             return None
-        thickness, stiffness, damping, _ = (value.to(modulus) for value in self.values())
+        thickness, stiffness, damping = (x.exp().to(modulus) for x in (self.log_thickness, self.log_stiffness, self.log_damping))
         per_mass = stiffness * modulus / (thickness * mass)
-        return torch.stack([(thickness * spacing).expand_as(per_mass), per_mass, damping * per_mass.sqrt()], dim=1)
+        depth = (thickness * spacing - relief).clamp(min=THINNEST * spacing).to(per_mass)
+        return torch.stack([depth, per_mass, 2.0 * damping * per_mass.sqrt()], dim=1)
 
 
 class ElasticBodies(nn.Module):
@@ -187,14 +191,9 @@ class ElasticBodies(nn.Module):
         modulus = spacing ** (2 - self.dim)
         of_node = [value.to(device) for value in constants]
         lam, mu, eta = ((value * modulus)[cells.nodes].mean(dim=1) for value in of_node)
-        normal, gap, friction = store["wall"].split([self.dim, 1, 1], dim=1)
-        wall_layer = cast(WallLayer, self.wall_layer[m])
-        layer, slip = wall_layer.of_nodes(of_node[0] + 2.0 * of_node[1], mass.to(device), spacing), wall_layer.values()[3].to(device)
-        friction = friction[:, 0] * friction_factor
-        walls = Walls(normal, gap[:, 0] - self.wall_distance[m].to(device) * spacing, friction / (1.0 + slip * friction), layer)
+        walls = self._walls(m, store, of_node[0] + 2.0 * of_node[1], mass.to(device))
         ends, corner = store["corner_index"], store["corner"]
-        at_corner = corner[:, self.dim] * friction_factor
-        at_corner = (at_corner / (1.0 + slip * at_corner)).detach()
+        at_corner = cast(WallLayer, self.wall_layer[m]).slipping(corner[:, self.dim] * friction_factor).detach()
         corners = Corners(ends, body_pos.double()[ends[:, 0]] + corner[:, : self.dim], at_corner)
         touching = self._touching(m, data, own.to(device), (of_node[0], of_node[1]))
         way, at_end, law = elastic_motion(
@@ -204,6 +203,14 @@ class ElasticBodies(nn.Module):
         if with_stress:
             stress = (cauchy_stress(body_pos + way, law, cells) / self.stress_unit.to(device)).to(acceleration)
         return ((way - mean - gravity) / unit).to(acceleration), at_end.to(mass.device), stress
+
+    def _walls(self, m: str, store: dict[str, Tensor], modulus: Tensor, mass: Tensor) -> Walls:
+        """Return the walls of the nodes of a material, on the device of its entries."""
+        layer, spacing = cast(WallLayer, self.wall_layer[m]), self.spacing.to(mass.device)
+        normal, gap, friction = store["wall"].split([self.dim, 1, 1], dim=1)
+        gap = gap[:, 0] - self.wall_distance[m].to(mass.device) * spacing
+        of_layer = layer.of_nodes(store["relief"], modulus, mass, spacing)
+        return Walls(normal, gap, layer.slipping(friction[:, 0] * self.log_friction[m].exp().to(mass.device)), of_layer)
 
     def _touching(self, m: str, data: HeteroData, params: Tensor, lame: tuple[Tensor, Tensor]) -> Touching:
         """Return the pairs of nodes of different bodies, on the device of the constants λ and μ of the nodes."""
@@ -222,24 +229,31 @@ class ElasticBodies(nn.Module):
         host = {key: store[key].cpu() for key in ENTRIES}
         mass_on_host, scene = mass.cpu(), store.batch.cpu() if "batch" in store else None
         cells = cells_at_rest(m, _with_attached(host, scene), host["rest_pos"], mass_on_host, scene)
-        law = cast(Constants, self.constants[m]).logarithm
-        units = [self.acceleration_unit, self.spacing, self.stress_unit, self.log_friction[m].exp(), self.wall_distance[m] * self.spacing]
-        thickness, *others = cast(WallLayer, self.wall_layer[m]).values()
-        units += [thickness * self.spacing, *others]
         moved, at_end = np.empty(acceleration.shape, _array(acceleration).dtype), np.empty(acceleration.shape)
         components = 4 if self.dim == 2 else 6
         stress = np.empty((len(mass) if with_stress else 0, components), moved.dtype)
         own = mass.new_empty(len(mass), 0) if params is None else params
-        touching = Touching.nothing(acceleration.new_empty(0, self.dim, dtype=torch.float64))
-        if cast(BodyLayer, self.body_layer[m]).has_thickness and len(store.touch_index):
-            lam, mu, _ = cast(Constants, self.constants[m])(own)
-            touching = self._touching(m, data, own, (lam, mu))
+        lam, mu, eta = (value.cpu() for value in cast(Constants, self.constants[m])(own))
+        touching = self._touching(m, data, own.cpu(), (lam, mu))
+        walls = self._walls(m, host, lam + 2.0 * mu, mass_on_host)
+        at_corner = cast(WallLayer, self.wall_layer[m]).slipping(host["corner"][:, self.dim] * self.log_friction[m].exp().cpu())
+        layer = torch.zeros(len(mass), 3) if walls.layer is None else walls.layer
         held = _array(store.prescribed) if "prescribed" in store else np.zeros((0, self.dim), bool)
-        entries = (host[key] for key in ("body_pos", "velocity", "wall", "corner_index", "corner"))
+        forces = (acceleration, data.gravity, mass_on_host)
+        contacts = (
+            walls.normal,
+            walls.gap.double(),
+            walls.friction.double(),
+            layer.double(),
+            host["corner_index"],
+            host["corner"],
+            at_corner.double(),
+        )
         move_bodies(
-            _array(own), _array(law["weight"]), _array(law["bias"]), LOGARITHM_SCALE, _array(acceleration), _array(data.gravity),
-            _array(mass_on_host), held, *map(_array, entries), *map(_array, (touching.nodes, touching.way, touching.law)), *cells.arrays,
-            np.array([float(x) for x in units]), (float(MAX_SUBSTEPS), STABLE, SHARE, APPROACH), moved, at_end, stress,
+            _array(torch.stack([lam, mu, eta], dim=1).double()), *map(_array, forces), held, _array(host["body_pos"]), _array(host["velocity"]),
+            *map(_array, contacts), *map(_array, (touching.nodes, touching.way, touching.law)), *cells.arrays,
+            tuple(float(unit) for unit in (self.acceleration_unit, self.spacing, self.stress_unit)),
+            (float(MAX_SUBSTEPS), STABLE, SHARE, APPROACH), moved, at_end, stress,
         )  # fmt: skip
         found, velocity, tensions = (torch.from_numpy(a).to(mass.device) for a in (moved, at_end, stress))
         return found, velocity, tensions if with_stress else None

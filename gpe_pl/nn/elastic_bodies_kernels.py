@@ -22,73 +22,65 @@ KEPT = 2
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def move_bodies(
-    params, weight, bias, scale, acceleration, gravity, mass, held, body_pos, velocity, wall, corner_index, corner, touching, way, touch, nodes, gradient,
-    volume, rate, cell_start, node_start, units, limits, moved, at_end, stress,
+    constants, acceleration, gravity, mass, held, body_pos, velocity, wall_normal, wall_gap, friction, wall_layer, corner_index, corner,
+    corner_friction, touching, way, touch, nodes, gradient, volume, rate, cell_start, node_start, units, limits, moved, at_end, stress,
 ):  # fmt: skip
     """Compute the motion of the bodies of one material in all scenes of a graph.
 
     Args:
-        params: standardised material parameters [node, param].
-        weight, bias: affine map of the parameters to the logarithms of λ, μ and η [3, param] and [3], in units of ``scale``.
-        scale: factor of the logarithms.
+        constants: λ, μ and η of nodes [node, 3], see ``elastic_motion.Constants``.
         acceleration: accelerations without gravity by all but cells and walls [node, dim].
         gravity: gravity of each scene [scene, dim] in m/frame².
         mass: masses [node].
         held: axes along which nodes keep their velocity [node, dim], or without rows if there are none.
-        body_pos, velocity, wall, corner_index, corner: entries of the graph, see ``graphs.builder``.
+        body_pos, velocity, corner_index, corner: entries of the graph, see ``graphs.builder``.
+        wall_normal, wall_gap, friction, wall_layer: of the walls of nodes, see ``elastic_motion.Walls``; zeros stand for no layer.
+        corner_friction: Coulomb coefficient of each corner [pair].
         touching, way, touch: pairs of nodes of different bodies, see ``elastic_touch.Touching``; ``touch`` is softened in place.
         nodes, gradient, volume, rate: of cells, see ``elastic_motion.Cells``.
         cell_start, node_start: first cell and node of each scene, and their numbers [scene + 1].
-        units: units of accelerations, of length, and of stresses, factor of the friction, distance in m at which walls stop nodes, and four values of the
-            layer in front of it, see ``elastic_bodies.WallLayer``.
+        units: units of accelerations, of length, and of stresses.
         limits: largest number of substeps, length of a substep as a fraction of the largest one that is stable, and two constants of ``soften_touching``.
         moved: accelerations without gravity that move the nodes as far [node, dim]; a result.
         at_end: velocities at the end of the frame [node, dim] in m/frame; a result.
         stress: Cauchy stress at the end of the frame [node, component], or without rows; a result.
     """
     num_nodes, dim = acceleration.shape
-    acceleration_unit, spacing, stress_unit, friction_factor, wall_distance, thickness, layer_stiffness, layer_damping, slip = units
+    acceleration_unit, spacing, stress_unit = units
     pos, vel, forcing, weights = (
         np.empty((num_nodes, dim)),
         np.empty((num_nodes, dim)),
         np.empty((num_nodes, dim)),
         np.empty((num_nodes, dim)),
     )
-    normal, gap, friction = np.empty((num_nodes, dim)), np.empty(num_nodes), np.empty(num_nodes)
+    normal, gap, layer = np.empty((num_nodes, dim)), np.empty(num_nodes), np.zeros((num_nodes, 3))
     for s in range(len(node_start) - 1):
         for n in range(node_start[s], node_start[s + 1]):
-            gap[n], coefficient = max(wall[n, dim] - wall_distance, 0.0), wall[n, dim + 1] * friction_factor
-            friction[n] = coefficient / (1.0 + slip * coefficient)
+            gap[n] = max(wall_gap[n], 0.0)
             for a in range(dim):
-                pos[n, a], vel[n, a], normal[n, a] = body_pos[n, a], velocity[n, dim + a], wall[n, a]
+                pos[n, a], vel[n, a], normal[n, a] = body_pos[n, a], velocity[n, dim + a], wall_normal[n, a]
                 forcing[n, a], weights[n, a] = acceleration[n, a] * acceleration_unit + gravity[s, a], mass[n]
                 if len(held) and held[n, a]:
                     forcing[n, a], weights[n, a] = 0.0, HEAVY
             if len(held) and held[n].any():
                 normal[n] = 0.0  # walls do not move a held node
-    point, point_friction = np.empty((len(corner), dim)), np.empty(len(corner))
+    point = np.empty((len(corner), dim))
     for k in range(len(corner)):
-        coefficient = corner[k, dim] * friction_factor
-        point_friction[k] = coefficient / (1.0 + slip * coefficient)
         for a in range(dim):
             point[k, a] = pos[corner_index[k, 0], a] + corner[k, a]
-    of_node = _constants(params, weight, bias, scale)
-    lam, mu, eta = _of_cells(of_node, spacing ** (2 - dim), nodes)
+    lam, mu, eta = _of_cells(constants, spacing ** (2 - dim), nodes)
     number = np.empty(len(node_start) - 1, np.int64)
     for s in range(len(number)):
         number[s] = _soften(pos, lam, mu, eta, nodes, gradient, rate, cell_start[s], cell_start[s + 1], limits[0], limits[1])
-    layer = np.zeros((num_nodes, 3))
-    for s in range(len(number) if thickness > 0.0 else 0):
         for n in range(node_start[s], node_start[s + 1]):
-            stiffness = layer_stiffness * (of_node[n, 0] + 2.0 * of_node[n, 1]) * spacing / (thickness * mass[n])
-            layer[n, 0], layer[n, 1] = thickness, min(stiffness, 0.5 * float(number[s]) ** 2)
-            layer[n, 2] = min(layer_damping * math.sqrt(stiffness), 0.5 * number[s])
+            layer[n, 0], layer[n, 1] = wall_layer[n, 0], min(wall_layer[n, 1], 0.5 * float(number[s]) ** 2)
+            layer[n, 2] = min(wall_layer[n, 2], 0.5 * number[s])
     pair_start, touch_start = _first_of_scenes(corner_index, node_start), _first_of_scenes(touching, node_start)
     soften_touching(touching, way, touch, mass, vel, number, node_start, touch_start, limits[2], limits[3])
     path, speed_path, pushed = np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim))
     contacts = np.zeros((KEPT, len(corner), 6))
     move_forward(
-        pos, vel, forcing, weights, lam, mu, eta, normal, gap, friction, layer, point, point_friction, way, touch, corner_index, touching, nodes,
+        pos, vel, forcing, weights, lam, mu, eta, normal, gap, friction, layer, point, corner_friction, way, touch, corner_index, touching, nodes,
         gradient, volume, cell_start, node_start, pair_start, touch_start, number, path, speed_path, pushed, contacts, at_end,
     )  # fmt: skip
     for s in range(len(number)):
@@ -113,20 +105,6 @@ def _first_of_scenes(pairs, node_start):
             start[scene] = k
     start[scene + 1 :] = len(pairs)
     return start
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
-def _constants(params, weight, bias, scale):
-    """Return λ, μ and η of each node [node, 3]; see ``elastic_motion.Constants``."""
-    of_node = np.empty((len(params), 3))
-    for n in range(len(params)):
-        for k in range(3):
-            logarithm = float(bias[k])
-            for c in range(params.shape[1]):
-                logarithm += params[n, c] * weight[k, c]
-            of_node[n, k] = math.exp(min(max(scale * logarithm, -20.0), 20.0))
-    return of_node
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

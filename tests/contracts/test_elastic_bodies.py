@@ -135,6 +135,34 @@ def test_the_compiled_motion_equals_the_plain_one(
         torch.testing.assert_close(value["solid"], other["solid"], rtol=0, atol=tolerance * float(other["solid"].abs().max()))
 
 
+@pytest.mark.parametrize("num_bodies", [1, 2])
+def test_derivatives_pass_from_walls_and_other_bodies_to_positions(num_bodies: int) -> None:
+    """Gradients of unrolls need them. The planes of walls count as constant, which is exact in front of flat walls."""
+    simulated = simulator(("solid",), wall_layer=2.0, body_layer=3.0)
+    build, model = DoubleBuilder(simulated.builder.config, simulated.builder.metadata), cast(GPE, simulated.model).double()
+    state = scenes.mesh_state("lattice", ("solid",), seed=0, num_bodies=num_bodies)
+    assert state.rest_pos is not None
+    noise, weight, way = np.random.default_rng(0).normal(size=(3, *state.pos.shape))
+    pos, low = state.rest_pos + 0.02 * scenes.SPACING * noise, float(state.rest_pos[:, 0].min()) - 0.5 * scenes.SPACING
+    boundary = Boundary.sample(domain_walls(((low, low + 3.0), (-1.0, 2.0)), 0.3), scenes.SPACING, 2)
+    state = replace(state, pos=pos, boundary=boundary, velocity_history=state.vel[:, None]).to_torch()
+
+    def total(pos: Tensor) -> Tensor:
+        graph = build(replace(state, pos=pos))
+        store = graph["solid"]
+        assert (store.wall[:, 2] < 1.5 * scenes.SPACING).any() and (len(store.touch) > 0) == (num_bodies > 1)
+        params, mass = {"solid": 0.0 * store.material_params.double()}, {"solid": torch.ones(len(pos), dtype=torch.float64)}
+        moved = model.elastic_bodies(graph, {"solid": torch.zeros_like(pos)}, params, mass, False)
+        return (torch.from_numpy(weight) * moved.acceleration["solid"]).sum()
+
+    start, step = state.pos.clone().requires_grad_(), 1e-6 * scenes.SPACING * torch.from_numpy(way)
+    total(start).backward()  # type: ignore[no-untyped-call]
+    assert start.grad is not None
+    with torch.no_grad():
+        expected = (total(state.pos + step) - total(state.pos - step)) / 2.0
+    assert float((start.grad * step).sum()) == pytest.approx(float(expected), rel=1e-6)
+
+
 def test_scenes_with_and_without_cells_move_as_alone() -> None:
     simulated = simulator(MIXED)
     mixed, cloud = bodies(materials=MIXED), scenes.state(12, ("sand",)).to_torch()
@@ -506,6 +534,31 @@ def test_the_layer_of_a_wall_limits_its_friction(friction: float, expected: floa
     sideways, upwards = (graph["elastomer"].mass.double()[:, None] * change).sum(dim=0).tolist()
     assert upwards > 0.1 * scenes.SPACING
     assert -sideways / upwards == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("plain", [False, True], ids=["compiled", "plain"])
+def test_the_layer_pushes_less_where_a_wall_is_sharp(plain: bool) -> None:
+    simulated, state = simulator(network=0.0, wall_layer=2.0), bodies(kind="lattice", walls=False)
+    assert state.rest_pos is not None
+    still = torch.zeros_like(state.pos)
+    start = replace(state, pos=state.rest_pos, vel=still, velocity_history=still[:, None], frame_velocity=still, gravity=0 * state.gravity)
+    graph = simulated.builder(start)
+    graph["elastomer"].wall = torch.tensor([0.0, 1.0, 1.0 * scenes.SPACING, 0.0]).expand(len(state.pos), 4)
+    pushed = []
+    for relief in (0.0, 0.5, 1.5):
+        graph["elastomer"].relief = torch.full((len(state.pos),), relief * scenes.SPACING)
+        with torch.no_grad(), unfused() if plain else nullcontext():
+            pushed.append(float(simulated(graph).frame_velocity["elastomer"][:, 1].mean()))
+    assert pushed[0] > 2.0 * pushed[1] > 0.0 and pushed[2] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_graph_has_the_relief_of_obstacles_and_none_of_domain_walls() -> None:
+    simulated = simulator(("solid",), wall_layer=2.0)
+    state = beside_an_obstacle(0, "triangles", 2)
+    relief = simulated.builder(state)["solid"].relief
+    assert relief.shape == (len(state.pos),) and relief.amax() > 0.2 * scenes.SPACING and (relief == 0).any()
+    walls = replace(state, boundary=Boundary.sample(state.boundary.shapes[:-1], scenes.SPACING, 2)).to_torch()
+    assert not simulated.builder(walls)["solid"].relief.any()
 
 
 def test_nodes_without_cells_keep_the_mean_velocities_of_free_flight() -> None:

@@ -1,0 +1,44 @@
+"""Constants of the layer of walls: by modulus and mass, thinner at sharp solids, and none without thickness."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from gpe_pl.nn.elastic_bodies import THINNEST, WallLayer
+
+SPACING = torch.tensor(0.02).double()
+MODULUS, MASS = torch.tensor([4.0, 8.0, 8.0]), torch.tensor([1.0, 1.0, 2.0])
+
+
+def of_nodes(layer: WallLayer, relief: tuple[float, ...] = (0.0, 0.0, 0.0)) -> torch.Tensor:
+    found = layer.of_nodes(torch.tensor(relief).double() * SPACING, MODULUS, MASS, SPACING)
+    assert found is not None
+    return found
+
+
+def test_stiffness_and_damping_depend_on_modulus_and_mass() -> None:
+    found = of_nodes(WallLayer(2.0))
+    assert found[:, 1].tolist() == pytest.approx([0.5 * 4.0 / 2.0, 0.5 * 8.0 / 2.0, 0.5 * 8.0 / 4.0])
+    assert found[:, 2].tolist() == pytest.approx([2 * 0.1 * math.sqrt(k) for k in found[:, 1].tolist()])
+
+
+def test_the_layer_is_thinner_by_the_relief_of_a_sharp_solid() -> None:
+    layer = WallLayer(2.0)
+    found = of_nodes(layer, (0.0, 0.6, 5.0))
+    assert found[:, 0].tolist() == pytest.approx([2.0 * 0.02, 1.4 * 0.02, THINNEST * 0.02])
+    assert found[:, 1].tolist() == pytest.approx(of_nodes(layer)[:, 1].tolist())
+
+
+def test_everything_is_learned() -> None:
+    layer = WallLayer(2.0)
+    (of_nodes(layer, (0.0, 0.6, 0.1)).sum() + layer.slipping(torch.ones(3)).sum()).backward()  # type: ignore[no-untyped-call]
+    assert all(p.grad is not None and bool(p.grad.any()) for p in layer.parameters())
+
+
+def test_without_thickness_there_is_no_layer() -> None:
+    layer = WallLayer(0.0)
+    assert layer.of_nodes(torch.zeros(3), MODULUS, MASS, SPACING) is None
+    assert not [*layer.parameters()] and layer.slipping(torch.ones(3)).tolist() == [1.0] * 3
