@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 _WALL, _SPHERE, _BOWL, _BOX, _POLYGON, _GRID = range(6)
-_MOST_KEPT = 64
+_MOST_KEPT = 256
 """Number of tuples of shapes whose packed form is cached."""
 
 

@@ -35,8 +35,8 @@ from gpe_pl.trajectory.boundary import as_numpy
 from gpe_pl.trajectory.state import State
 
 NO_EDGES = np.empty((0, 2), np.int64)
-PROBED = 1.5
-"""Largest distance from a wall at which its relief is computed, in rest spacings."""
+PROBED, FARTHEST = 1.5, 4.0
+"""Largest distance from a wall at which its relief is computed, and largest one of nodes that have a relief, in rest spacings."""
 WITHOUT_RELIEF = ("wall", "bowl")
 """Shapes that are nowhere sharper than a flat wall."""
 ATTACHED, FLATTEST, MOST_NEAR = 1.8, 0.1, 40
@@ -153,7 +153,8 @@ def _walls(topology: Topology, state: State, material: str, scales: Scales) -> T
 def _reliefs(state: State, rows: Tensor, wall: Tensor, spacing: float) -> Tensor:
     """Return how much farther the wall of each node seems to be, because it is sharp or thin there [node] in m; see ``geometry.relief``.
 
-    Nodes farther than ``PROBED`` from a wall have the relief of the point in front of it at this distance, since they may reach it within the frame.
+    A node farther than ``PROBED`` from a wall has the relief of the point in front of it at this distance, since it may reach it within the frame. Beyond
+    ``FARTHEST``, deep in a solid, and in scenes without shapes there is none.
     """
     boundary, dim = state.boundary, state.pos.shape[1]
     relief = wall.new_zeros(len(rows))
@@ -162,7 +163,7 @@ def _reliefs(state: State, rows: Tensor, wall: Tensor, spacing: float) -> Tensor
         return relief
     pos, (normal, distance) = as_numpy(state.pos[rows]), np.split(as_numpy(wall[:, : dim + 1]).astype(float), [dim], axis=1)
     beyond = np.maximum(distance - PROBED * spacing, 0.0)
-    near = (normal != 0).any(axis=1) & (distance[:, 0] < TOUCH_REACH * spacing)
+    near = (normal != 0).any(axis=1) & (-REACH * spacing < distance[:, 0]) & (distance[:, 0] < FARTHEST * spacing)
     points = pos[near] - beyond[near] * normal[near]
     beside = signed_distance(obstacles, points) < (REACH + SOFT) * spacing  # farther away the kernel meets no obstacle
     near[near] = beside

@@ -1,6 +1,6 @@
 """The motion of elastic bodies over a frame in one compiled call, for rollouts on a CPU: what ``elastic_bodies`` computes with PyTorch's operations.
 
-It keeps no substeps for a backward pass. Sums and constants are in double precision.
+It keeps no substeps for a backward pass. Sums are in double precision.
 """
 
 from __future__ import annotations

@@ -17,10 +17,12 @@ from torch_geometric.data import Batch
 
 from gpe_pl.benchmarks.stability.subject import in_flight
 from gpe_pl.export.program import export_model
+from gpe_pl.geometry.relief import reliefs
 from gpe_pl.geometry.shape_values import moved as moved_shape
 from gpe_pl.geometry.shapes import Box, domain_walls
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
+from gpe_pl.graphs.contacts import corners_near_edges, oriented_edges
 from gpe_pl.graphs.elastic_cells import attaching_cells
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.approximate import Repeating, Sleeping
@@ -553,12 +555,29 @@ def test_the_layer_pushes_less_where_a_wall_is_sharp(plain: bool) -> None:
 
 
 def test_a_graph_has_the_relief_of_obstacles_and_none_of_domain_walls() -> None:
+    """Nodes farther than 1.5 spacings have the relief of the point in front of the wall at this distance, since they may reach it within the frame."""
     simulated = simulator(("solid",), wall_layer=2.0)
     state = beside_an_obstacle(0, "triangles", 2)
-    relief = simulated.builder(state)["solid"].relief
-    assert relief.shape == (len(state.pos),) and relief.amax() > 0.2 * scenes.SPACING and (relief == 0).any()
-    walls = replace(state, boundary=Boundary.sample(state.boundary.shapes[:-1], scenes.SPACING, 2)).to_torch()
+    shapes, store, spacing = state.boundary.shapes, simulated.builder(state)["solid"], scenes.SPACING
+    normal, distance = store.wall[:, :2].double().numpy(), store.wall[:, 2].double().numpy()
+    near = normal.any(axis=1) & (np.abs(distance) < 3.0 * spacing)
+    in_front = state.pos.numpy() - np.maximum(distance - 1.5 * spacing, 0.0)[:, None] * normal
+    expected = np.where(near, reliefs(shapes, in_front, np.minimum(distance, 1.5 * spacing), spacing), 0.0)
+    far = normal.any(axis=1) & (distance > 3.0 * spacing)
+    assert ((expected > 0) & (distance > 2.0 * spacing)).any() and ((expected > 0) & (distance < 1.5 * spacing)).any()
+    np.testing.assert_allclose(store.relief.numpy()[~far], expected[~far], rtol=0, atol=1e-5 * spacing)
+    walls = replace(state, boundary=Boundary.sample(shapes[:-1], spacing, 2)).to_torch()
     assert not simulated.builder(walls)["solid"].relief.any()
+
+
+def test_the_way_to_a_corner_has_the_derivative_of_the_position() -> None:
+    state = beside_an_obstacle(0, "triangles", 1)
+    assert state.rest_pos is not None and state.cells is not None
+    pos, edges = state.pos.clone().requires_grad_(), oriented_edges(state.rest_pos, state.cells)
+    ends, corner = corners_near_edges(pos, edges, state.boundary, scenes.SPACING, 3.0 * scenes.SPACING)
+    assert len(corner)
+    (grad,) = torch.autograd.grad(corner[:, :2].sum(), pos)
+    torch.testing.assert_close(grad, -torch.bincount(ends[:, 0], minlength=len(pos)).double()[:, None].expand_as(grad))
 
 
 def test_nodes_without_cells_keep_the_mean_velocities_of_free_flight() -> None:
