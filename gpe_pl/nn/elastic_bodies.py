@@ -232,7 +232,8 @@ class ElasticBodies(nn.Module):
         moved, at_end = np.empty(acceleration.shape, _array(acceleration).dtype), np.empty(acceleration.shape)
         components = 4 if self.dim == 2 else 6
         stress = np.empty((len(mass) if with_stress else 0, components), moved.dtype)
-        own = store.body_pos.new_empty(len(mass), 0) if params is None else params.to(store.body_pos.dtype)
+        weight = cast(Constants, self.constants[m]).logarithm["weight"]
+        own = weight.new_empty(len(mass), 0) if params is None else params.to(weight.dtype)
         lam, mu, eta = (value.cpu() for value in cast(Constants, self.constants[m])(own))
         touching = self._touching(m, data, own.cpu(), (lam, mu))
         walls = self._walls(m, host, lam + 2.0 * mu, mass_on_host)
