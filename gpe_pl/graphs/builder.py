@@ -78,7 +78,7 @@ class GraphBuilder:
     - ``velocity``: mean velocity over the last frame, then velocity at the frame [node, 2 dim] in m/frame
     - ``wall``: normal, distance [m] and friction of the plane of the nearest wall [node, dim + 2]; zero without a wall within the radius
     - ``relief``: how much farther this wall seems to be, because it is sharp or thin there [node] in m (see ``geometry.relief``); zero
-      in scenes without shapes, such as mirror images
+      in scenes without shapes, such as mirror images, and without ``reads_relief``
     - ``corner_index`` [pair, 2] and ``corner`` [pair, dim + 1], for each pair of an edge of a body and a nearby corner of an obstacle: the nodes at the ends of
       the edge; the vector from the first of them to the corner [m] and the friction of the corner. Empty in 3D
     - ``touch_index`` and ``touch``: pairs of nodes of different bodies within ``schema.TOUCH_REACH`` and the radius [pair, 2], and the vector from the second
@@ -93,6 +93,7 @@ class GraphBuilder:
         metadata: metadata of the data set.
         skips: levels of skipping. Those that act here are exact, so they do not change the graph.
         reference: metadata of the data set whose scales are the units of all others, with ``config.scales`` other than ``one``; None for ``metadata``.
+        reads_relief: whether ``relief`` is computed. It takes time, and only models with an elastic layer of walls read it.
         precision: floating-point type of ``x``, ``odd``, ``even``, ``mass`` and ``pos``.
 
     Raises:
@@ -103,6 +104,7 @@ class GraphBuilder:
     metadata: Metadata
     skips: Skips = field(default_factory=Skips)
     reference: Metadata | None = None
+    reads_relief: bool = True
     precision: ClassVar[torch.dtype] = torch.float32
 
     def __post_init__(self) -> None:
@@ -248,7 +250,7 @@ class GraphBuilder:
 
     def _with_cells(self, data: HeteroData, topology: Topology, state: State) -> HeteroData:
         if self.spec.cells:
-            add_cells(data, topology, state, self.spec, self.scales, self.precision)
+            add_cells(data, topology, state, self.spec, self.scales, self.precision, self.reads_relief)
         return data
 
     def batch(self, topologies: Sequence[Topology], states: Sequence[State], standards: Standards | None = None) -> HeteroData:

@@ -44,7 +44,9 @@ ATTACHED, FLATTEST, MOST_NEAR = 1.8, 0.1, 40
 of nearest nodes that are tried."""
 
 
-def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureSpec, scales: Scales, precision: torch.dtype) -> None:
+def add_cells(
+    data: HeteroData, topology: Topology, state: State, spec: FeatureSpec, scales: Scales, precision: torch.dtype, reads_relief: bool
+) -> None:
     """Add the cells of each material of meshes, their rest shape, velocities, and what they may touch to a graph. ``GraphBuilder`` lists the entries.
 
     Args:
@@ -54,6 +56,7 @@ def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureS
         spec: channels of the graph.
         scales: units of the data set.
         precision: precision of floating-point values.
+        reads_relief: whether the relief of walls is computed; otherwise it is zero.
 
     Raises:
         GraphError: cells are surfaces or of several kinds, or walls move.
@@ -66,7 +69,8 @@ def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureS
     for material in spec.meshes:
         at_rest = _at_rest(topology, state, material, dim, precision, scales.spacing)
         entries = (_entries_in_compiled_loops if compiled else _entries)(topology, state, material, at_rest, scales, precision)
-        entries["relief"] = _reliefs(state, topology.rows[material], entries["wall"], scales.spacing)
+        wall = entries["wall"]
+        entries["relief"] = _reliefs(state, topology.rows[material], wall, scales.spacing) if reads_relief else wall.new_zeros(len(wall))
         touching = _touching(topology, state, material, TOUCH_REACH * scales.spacing, precision)
         own = {"cell_index": at_rest.cell_index, "attached_index": at_rest.attached_index, "rest_pos": at_rest.pos}
         data[material].update({**own, **entries, **touching})

@@ -94,7 +94,8 @@ class LearnedSimulator(nn.Module):
         super().__init__()
         if builder.spec.reads_stress and not model.settings.get("stress", False):
             raise GraphError("graph.stress=true: the model predicts no stress, which its next step reads; set model.stress=true")
-        self.model, self.builder, self.stride = model, builder, stride
+        self.model, self.stride = model, stride
+        self.builder = replace(builder, reads_relief=bool(model.settings.get("wall_layer")))
         self._static_friction, self._averaged = 0.0, MirrorAverage(builder.metadata.bounds)
         self._warned: set[str] = set()
         self._unknown: list[str | EdgeType] | None = None  # None: not determined yet

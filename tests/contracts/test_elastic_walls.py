@@ -17,6 +17,7 @@ from gpe_pl.graphs.contacts import corners_near_edges, oriented_edges
 from gpe_pl.models.gpe import GPE
 from gpe_pl.system.compiled import unfused
 from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 from tests import scenes
 from tests.elastic import ACCELERATION, DT, DoubleBuilder, beside_an_obstacle, bodies, simulator
 
@@ -80,6 +81,26 @@ def test_a_graph_has_the_relief_of_obstacles_and_none_of_domain_walls() -> None:
     np.testing.assert_allclose(store.relief.numpy()[~far], expected[~far], rtol=0, atol=1e-5 * spacing)
     walls = replace(state, boundary=Boundary.sample(shapes[:-1], spacing, 2)).to_torch()
     assert not simulated.builder(walls)["solid"].relief.any()
+
+
+def test_a_model_without_a_layer_of_walls_skips_the_relief(monkeypatch: pytest.MonkeyPatch) -> None:
+    state, (thick, thin) = beside_an_obstacle(0, "triangles", 2), (simulator(("solid",), wall_layer=thickness) for thickness in (2.0, 0.0))
+    assert thick.builder(state)["solid"].relief.any()
+    with torch.no_grad():
+        expected = thin.next_states([state])[0]
+        computed = thin(replace(thin.builder, reads_relief=True)(state)).frame_velocity["solid"]
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the relief was computed")
+
+    monkeypatch.setattr("gpe_pl.graphs.elastic_cells.reliefs", refuse)
+    assert not thin.builder(state)["solid"].relief.any()
+    with torch.no_grad():
+        torch.testing.assert_close(thin(thin.builder(state)).frame_velocity["solid"], computed, rtol=0, atol=0)
+        found = thin.at(frame_dt=thin.builder.metadata.frame_dt).next_states([state])[0]
+    assert torch.equal(cast(State, found).pos, cast(State, expected).pos)
+    with pytest.raises(AssertionError, match="the relief was computed"):
+        thick.builder(state)
 
 
 def test_the_way_to_a_corner_has_the_derivative_of_the_position() -> None:
