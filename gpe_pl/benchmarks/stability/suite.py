@@ -93,26 +93,28 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
 
     Raises:
         NothingToTestError: no data set has a model, or two models of a data set have one name.
+        CheckpointError: a checkpoint of ``settings`` cannot be loaded. It is raised before the first test.
     """
     parts = FinishedParts(folder / PARTS)
     records: list[dict[str, Any]] = []
-    untested = [name for name, spec in specs.items() if not any(_models(spec, settings))]
-    tested = {name: spec for name, spec in specs.items() if name not in untested}
+    checkpoints = {name: _checkpoints(spec, settings) for name, spec in specs.items()}  # read once: runs may finish while the suite runs
+    untested = [name for name, models in checkpoints.items() if not models]
+    tested = [(name, specs[name], models) for name, models in checkpoints.items() if models]
     if min(settings.num_workers, len(tested)) > 1:
         with ProcessPoolExecutor(settings.num_workers, multiprocessing.get_context("spawn"), _show_progress) as pool:
-            for found in pool.map(_test_domain, tested, tested.values(), repeat(settings), repeat(parts)):
+            for found in pool.map(_test_domain, *zip(*tested, strict=True), repeat(settings), repeat(parts)):
                 records += found
     else:
-        for name, spec in tested.items():
-            records += _test_domain(name, spec, settings, parts)
+        for domain in tested:
+            records += _test_domain(*domain, settings, parts)
     if not records:
         raise NothingToTestError(
             f"{', '.join([*settings.runs, *settings.checkpoints]) or 'suite.runs and suite.checkpoints are empty'}: no model that was trained on one of "
             f"{', '.join(f'{s.name} {s.size}' for s in specs.values())}; train with `python -m gpe_pl.fit data={untested[0]} model=gpe_tuned` or set "
             "suite.runs or suite.checkpoints"
         )
-    for name, spec in tested.items():
-        for label, _, path in _models(spec, settings):
+    for name, _, models in tested:
+        for label, path in models.items():
             _write_verdict(path, [r for r in records if (r["domain"], r["model"]) == (name, label)], folder)
     parts.clear()
     return records, report(records, untested)
@@ -132,14 +134,12 @@ def _show_progress() -> None:
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s][%(name)s][%(levelname)s] - %(message)s")
 
 
-def _test_domain(name: str, spec: DatasetSpec, settings: Settings, parts: FinishedParts) -> list[dict[str, Any]]:
-    """Return the records of all models of a data set."""
+def _test_domain(
+    name: str, spec: DatasetSpec, checkpoints: dict[str, Path], settings: Settings, parts: FinishedParts
+) -> list[dict[str, Any]]:
+    """Return the records of all models of a data set, given their checkpoints by name."""
     torch.set_num_threads(settings.num_threads)
-    models: dict[str, LearnedSimulator] = {}
-    for label, simulator, _ in _models(spec, settings):
-        if label in models:
-            raise NothingToTestError(f"two models of {spec.name} are called {label}; copy one of the checkpoints to a file of another name")
-        models[label] = simulator
+    models = {label: of_stored_frames(path) for label, path in checkpoints.items()}
     return [record for subject in subjects(name, spec, models, settings) for record in test(subject, settings.tests, parts)]
 
 
@@ -238,15 +238,18 @@ def is_gating(simulator: LearnedSimulator, gating: dict[str, str]) -> bool:
     return bool(gating) and all(own.get(key) == value for key, value in gating.items())
 
 
-def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, LearnedSimulator, Path]]:
-    """Yield the names, simulators and checkpoints of all models of a data set."""
-    found = trained_on(spec, runs_in(settings.runs))
-    yield from ((name, simulator, checkpoint_path(run.folder)) for name, (simulator, run) in found.items())
+def _checkpoints(spec: DatasetSpec, settings: Settings) -> dict[str, Path]:
+    """Return the checkpoints of all models of a data set by name. Each has been loaded once."""
+    found = {name: checkpoint_path(run.folder) for name, (_, run) in trained_on(spec, runs_in(settings.runs)).items()}
     for checkpoint in settings.checkpoints:
-        simulator = of_stored_frames(checkpoint)
-        metadata = simulator.builder.metadata
+        metadata, label = of_stored_frames(checkpoint).builder.metadata, checkpoint_label(checkpoint)
         if (metadata.dataset, metadata.spacing) == (spec.name, spec.scene.spacing):
-            yield checkpoint_label(checkpoint), simulator, checkpoint_path(checkpoint)
+            if label in found:
+                raise NothingToTestError(
+                    f"two models of {spec.name} are called {label}; copy one of the checkpoints to a file of another name"
+                )
+            found[label] = checkpoint_path(checkpoint)
+    return found
 
 
 def failures(records: Sequence[dict[str, Any]]) -> list[str]:

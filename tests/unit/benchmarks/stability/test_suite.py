@@ -23,7 +23,7 @@ from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.learned.verdicts import headline
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
@@ -335,3 +335,27 @@ def test_two_checkpoints_of_one_name_are_an_error(spec: DatasetSpec, scenes: lis
     settings = Settings({"sand": Case([])}, [], [str(f) for f in files], SHIPPED, 1, [1.0], 5, [19])
     with pytest.raises(NothingToTestError, match="two models of sand are called model"):
         run(settings, {"sand": spec}, tmp_path / "results")
+
+
+def test_a_run_that_finishes_during_the_suite_takes_no_part(
+    spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The suite runs for minutes, and trainings may go on beside it. Their checkpoints must not stop it at its end."""
+    subject(spec, scenes, **SHIPPED).simulator.save(tmp_path / "own.ckpt")
+    settings = Settings({"sand": Case([])}, [str(tmp_path / "runs")], [str(tmp_path / "own.ckpt")], SHIPPED, 1, [1.0], 5, [1])
+    late: list[Run] = []
+    monkeypatch.setattr(suite, "runs_in", lambda _: list(late))
+
+    def finishing(*_: object) -> Outcome:
+        file = tmp_path / "late" / "checkpoints" / "best.ckpt"
+        file.parent.mkdir(parents=True)
+        file.write_bytes(b"a checkpoint of another version")
+        late.append(Run(tmp_path / "late", {"data.name": spec.name, "size.name": spec.size}, table_of([])))
+        return Outcome(True, "as it should be")
+
+    monkeypatch.setattr(suite, "_outcome", finishing)
+    records, _ = run(settings, {"sand": spec}, tmp_path / "results")
+    assert [r["model"] for r in records] == ["own"]
+    with pytest.raises(CheckpointError, match="late/checkpoints/best.ckpt: "):
+        run(settings, {"sand": spec}, tmp_path / "results")
+    assert len(late) == 1
