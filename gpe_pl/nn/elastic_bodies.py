@@ -24,7 +24,7 @@ from gpe_pl.system.compiled import is_wanted
 MAX_CACHED = 64
 """Largest number of graphs whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
 FIRST_STIFFNESS, FIRST_DAMPING, FIRST_MOST_FRICTION = 0.5, 0.1, 0.7
-"""Stiffness, damping and largest friction of the layer of walls before training; the damping is a fraction of the critical one."""
+"""Stiffness, damping and largest friction of the layer of walls before training; the damping at the wall is a fraction of the critical one."""
 THINNEST = 0.01
 """Least thickness of the layer of walls, in rest spacings."""
 ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "relief", "cell_index", "attached_index", "corner_index", "corner")

@@ -165,7 +165,8 @@ def _wall_contact(distance, along, layer, h):
     """Return the change of a node's normal velocity by its wall, positive in contact, and whether the node stops on the plane of the wall."""
     soft, stop = 0.0, -distance / h - along
     if 0.0 < layer[0] > distance:
-        soft = h * (layer[1] * (layer[0] - distance) ** 2 / layer[0] - layer[2] * min(along, 0.0))
+        depth = 1.0 - distance / layer[0]
+        soft = h * (layer[1] * layer[0] * depth**2 - layer[2] * depth * min(along, 0.0))
     return (stop, True) if stop >= soft else (soft, False)
 
 
@@ -447,13 +448,14 @@ def pull_back(
                             of_distance, of_along = -(of_normal + of_change) / h, -of_change
                         else:
                             of_soft = h * (of_normal + of_change)
-                            depth = (layer[n, 0] - distance) / layer[n, 0]
-                            of_distance, of_along = -2.0 * depth * layer[n, 1] * of_soft, of_normal
-                            grad_layer[n, 0] += (2.0 - depth) * depth * layer[n, 1] * of_soft
+                            depth, towards = 1.0 - distance / layer[n, 0], min(along, 0.0)
+                            of_depth = (2.0 * layer[n, 1] * layer[n, 0] * depth - layer[n, 2] * towards) * of_soft
+                            of_distance, of_along = -of_depth / layer[n, 0], of_normal
+                            grad_layer[n, 0] += layer[n, 1] * depth**2 * of_soft + of_depth * (1.0 - depth) / layer[n, 0]
                             grad_layer[n, 1] += depth**2 * layer[n, 0] * of_soft
                             if along < 0.0:
-                                of_along -= layer[n, 2] * of_soft
-                                grad_layer[n, 2] -= along * of_soft
+                                of_along -= layer[n, 2] * depth * of_soft
+                                grad_layer[n, 2] -= depth * along * of_soft
                         for i in range(dim):
                             tangential = pushed[k, n, i] - along * normal[n, i]
                             own = grad_vel[n, i] - of_normal * normal[n, i]

@@ -11,9 +11,12 @@ stress, as in ``solvers.fem.elements`` (Bonet & Wood 2008, section 6.4.3)::
     P = μ F + (λ log J − μ)/J cof F + η F (Fᵀ Ḟ + Ḟᵀ F)
 
 A node that would enter the plane of its nearest wall loses just enough normal velocity to arrive on it. Walls may have an elastic layer in front of this plane.
-It pushes a node at distance d with the acceleration ``k (D − d)²/D``, with the thickness D and the stiffness per mass k, and damps its motion towards the wall.
-Coulomb friction takes tangential velocity. Bodies may act on each other (see ``nn.elastic_touch``). Cells that are torn at the start of a frame carry no
-forces. Forces of cells change neither the linear nor the angular momentum of a body.
+With the thickness D it pushes a node at distance d with the acceleration ``k D δ² + c δ v``. δ = 1 − d/D is the relative depth, k the stiffness per mass, c the
+damping per mass, and v the speed towards the wall, 0 for a node that moves away. The damping grows with the depth, as in Hunt & Crossley (1975, J. Appl. Mech.
+42), so the force does not jump where the layer begins. Coulomb friction takes tangential velocity.
+
+Bodies may act on each other (see ``nn.elastic_touch``). Cells that are torn at the start of a frame carry no forces. Forces of cells change neither the linear
+nor the angular momentum of a body.
 
 Units: time is in frames, length in m, and masses in any unit. λ and μ are in that unit of mass per m^(dim − 2) and frame², and η is in that times a frame.
 """
@@ -143,7 +146,7 @@ class Walls:
         normal: outward normals [node, dim]; zero where no wall is near.
         gap: distances of the nodes from their planes [node] in m.
         friction: Coulomb coefficients [node].
-        layer: thickness of the elastic layer in m, its stiffness per mass in 1/frame², and its damping per mass in 1/frame [node, 3]; None stands for none.
+        layer: thickness of the elastic layer in m, its stiffness per mass in 1/frame², and its largest damping per mass in 1/frame [node, 3]; None for none.
     """
 
     normal: Float[Tensor, "node dim"]
@@ -294,8 +297,8 @@ def _stopped(velocity: Tensor, moved: Tensor, normal: Tensor, gap: Tensor, frict
     along = (velocity * normal).sum(dim=1)
     distance = gap + (moved * normal).sum(dim=1)
     thickness, stiffness, damping = layer.unbind(dim=1)
-    push = stiffness * (thickness - distance).square() / thickness.clamp(min=1e-300)
-    soft = torch.where(distance < thickness, step * (push - damping * along.clamp(max=0.0)), 0.0)
+    depth = (1.0 - distance / torch.where(thickness > 0, thickness, torch.inf)).clamp(min=0.0)
+    soft = step * (stiffness * thickness * depth.square() - damping * depth * along.clamp(max=0.0))
     change = torch.maximum(-distance / step - along, soft)
     hits = (change > 0) & (normal != 0).any(dim=1)
     tangential = velocity - along[:, None] * normal

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from gpe_pl.nn.elastic_bodies import THINNEST, WallLayer
+from gpe_pl.nn.elastic_kernels import _wall_contact
+from gpe_pl.nn.elastic_motion import _stopped
 
 SPACING = torch.tensor(0.02).double()
 MODULUS, MASS = torch.tensor([4.0, 8.0, 8.0]), torch.tensor([1.0, 1.0, 2.0])
@@ -36,6 +38,25 @@ def test_everything_is_learned() -> None:
     layer = WallLayer(2.0)
     (of_nodes(layer, (0.0, 0.6, 0.1)).sum() + layer.slipping(torch.ones(3)).sum()).backward()  # type: ignore[no-untyped-call]
     assert all(p.grad is not None and bool(p.grad.any()) for p in layer.parameters())
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize(("speed", "damped"), [(-0.01, 0.01), (0.01, 0.0)], ids=["approaching", "leaving"])
+def test_push_and_damping_grow_with_the_depth(compiled: bool, speed: float, damped: float) -> None:
+    thickness, stiffness, damping, h = 0.04, 3.0, 5.0, 0.1
+    layer = torch.tensor([[thickness, stiffness, damping]], dtype=torch.float64)
+    for depth in (-0.5, 0.0, 0.25, 0.75):
+        distance = torch.tensor([thickness * (1.0 - depth)], dtype=torch.float64)
+        if compiled:
+            change, is_stopped = _wall_contact(float(distance), speed, layer[0].numpy(), h)
+            assert not is_stopped
+        else:
+            velocity, normal = torch.tensor([[0.0, speed]], dtype=torch.float64), torch.tensor([[0.0, 1.0]], dtype=torch.float64)
+            moved, friction = torch.zeros(1, 2).double(), torch.zeros(1).double()
+            new = _stopped(velocity, moved, normal, distance, friction, layer, torch.tensor([h], dtype=torch.float64))
+            change = float(new[0, 1]) - speed
+        depth = max(depth, 0.0)
+        assert change == pytest.approx(h * (stiffness * thickness * depth**2 + damping * depth * damped), rel=1e-9, abs=1e-12)
 
 
 def test_without_thickness_there_is_no_layer() -> None:
