@@ -25,6 +25,7 @@ UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "model.stress_unit": ("model.stress", lambda stress: stress is False),
     "model.wall_distance": ("model.elastic", lambda elastic: elastic is False),
     "model.wall_layer": ("model.elastic", lambda elastic: elastic is False),
+    "model.wall_damping": ("model.wall_layer", lambda thickness: thickness == 0),
     "model.body_layer": ("model.elastic", lambda elastic: elastic is False),
     "model.only_contacts": ("model.elastic", lambda elastic: elastic is False),
     "model.viscous": ("model.elastic", lambda elastic: elastic is False),

@@ -24,7 +24,7 @@ from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.gpe_program_runner import Decoded, GPEProgramRunner, notice
 from gpe_pl.nn.blocks import MLP, NORM_EPS
 from gpe_pl.nn.connected import Edges, merged_levels, order_of_edges, renumbered, reordered, touched
-from gpe_pl.nn.elastic_bodies import CellError, ElasticBodies
+from gpe_pl.nn.elastic_bodies import WALL_DAMPING, CellError, ElasticBodies
 from gpe_pl.nn.fused import works_on
 from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_processor
 from gpe_pl.nn.island_momentum import IslandMomentum, conserve, grouped, joined, moved_by_contacts
@@ -160,21 +160,19 @@ class GPE(Model):
         num_message_passing_steps: number of processor layers; 12 in the paper.
         hidden_channels: width of all hidden states and layers; 128 in the paper.
         implementation: ``factored`` or ``plain``; both compute the same function of the same parameters.
-        level_weights: ``shared`` has one set of weights for all levels of virtual nodes, which allows any number of levels; ``separate`` has one set per level
-            (paper).
+        level_weights: ``shared`` has one set of weights for all levels of virtual nodes, whose number is then free; ``separate`` one set per level (paper).
         stress: also decode the stress of materials that have one.
         node_norm: ``layer`` normalises the encoded state of every node and the update of each step, as GNS does. With the ``node`` decoder, accelerations then
             stay bounded in any rollout. ``none`` follows the paper.
         elastic: cells of meshes move their nodes through the whole frame by a constitutive law that the model learns (see ``nn.elastic_bodies``).
         wall_distance: with ``elastic``, initial value of the learned distance from walls at which nodes stop, in rest spacings.
         wall_layer: with ``elastic``, initial thickness of the learned elastic layer of walls in front of that, in rest spacings; 0 stands for no layer.
+        wall_damping: damping of this layer at the wall, a fraction of the critical one. It is not learned.
         body_layer: with ``elastic``, initial thickness of the learned layer between bodies, in rest spacings; 0 stands for no layer.
         only_contacts: with ``elastic`` and the ``contact`` decoder, the network adds forces between bodies, and nothing within bodies or at walls.
         viscous: with ``elastic``, cells also have a viscous stress with a learned constant. Choose false for data of solids without damping.
-        stress_unit: with ``stress`` and without ``elastic``, what the network decodes: the stress in the unit of the data set, or with ``strain`` the stress
-            per strain of its scene (see ``nn.strain_scale``).
-        island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or
-            ``ignored``.
+        stress_unit: with ``stress`` and without ``elastic``: decode the stress in the unit of the data set, or with ``strain`` per strain of its scene.
+        island_momentum: conserve the ``linear``, or also the ``angular``, momentum of free islands exactly (see ``nn.island_momentum``); or ``ignored``.
 
     Raises:
         StressError: ``stress`` without a material that has a stress.
@@ -200,6 +198,7 @@ class GPE(Model):
         elastic: bool = False,
         wall_distance: Annotated[float, Field(ge=0)] = 0.0,
         wall_layer: Annotated[float, Field(ge=0)] = 0.0,
+        wall_damping: Annotated[float, Field(ge=0)] = WALL_DAMPING,
         body_layer: Annotated[float, Field(ge=0)] = 0.0,
         only_contacts: bool = False,
         viscous: bool = True,
@@ -221,6 +220,7 @@ class GPE(Model):
             elastic=elastic,
             wall_distance=wall_distance,
             wall_layer=wall_layer,
+            wall_damping=wall_damping,
             body_layer=body_layer,
             only_contacts=only_contacts,
             viscous=viscous,
@@ -293,7 +293,7 @@ class GPE(Model):
             self.pair_decoder = nn.ModuleDict({self.key(r): PairForce(spec, r, hidden) for r in forces})
         if elastic:
             count = {m: spec.param_channels[m] if m in read else 0 for m in spec.meshes}
-            self.elastic_bodies = ElasticBodies(count, spec.dim, wall_distance, wall_layer, viscous, body_layer)
+            self.elastic_bodies = ElasticBodies(count, spec.dim, wall_distance, wall_layer, wall_damping, viscous, body_layer)
             zeroed = [cast(MLP, self.node_decoder[m])[2] for m in spec.meshes] if decoder != "pair" else []
             zeroed += [cast(PairForce, force).lin_out for force in self.pair_decoder.values()] if decoder == "pair" or self.bodies else []
             for layer in zeroed:  # training starts from the motion by cells and walls alone

@@ -23,8 +23,10 @@ from gpe_pl.system.compiled import is_wanted
 
 MAX_CACHED = 64
 """Largest number of graphs whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
-FIRST_STIFFNESS, FIRST_DAMPING, FIRST_MOST_FRICTION = 0.5, 0.1, 0.7
-"""Stiffness, damping and largest friction of the layer of walls before training; the damping at the wall is a fraction of the critical one."""
+FIRST_STIFFNESS, FIRST_MOST_FRICTION = 0.5, 0.7
+"""Stiffness and largest friction of the layer of walls before training."""
+WALL_DAMPING = 0.6
+"""Damping of the layer of walls at the wall, as a fraction of the critical one. Elastomers that fall level then bounce as high as in the material point method."""
 THINNEST = 0.01
 """Least thickness of the layer of walls, in rest spacings."""
 ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "relief", "cell_index", "attached_index", "corner_index", "corner")
@@ -50,23 +52,26 @@ class Moved(NamedTuple):
 
 
 class WallLayer(nn.Module):
-    """Elastic layer of walls, of the material of the body that it touches: thickness, stiffness, damping and largest friction are learned.
+    """Elastic layer of walls, of the material of the body that it touches: thickness, stiffness and largest friction are learned.
 
     The material point method has such a layer. Its particles feel a wall as soon as they share a cell of the grid with it, and deform on their way to it. The
     layer slips: bodies slide even on walls to which they should stick. So a friction μ acts as ``μ / (1 + μ/M)``, with the largest friction M. The layer is
     thinner where a solid is sharp or thin, by the relief of the solid, because the grid hardly sees it there (see ``geometry.relief``).
 
+    The damping is given. From single steps a model learns so much of it that bodies bounce too low, since the solver remembers a contact that the state does
+    not show, such as how near to the wall a body was.
+
     Args:
         thickness: thickness before training, in rest spacings; 0 stands for no layer, which is not learned.
+        damping: damping at the wall as a fraction of the critical one.
     """
 
-    def __init__(self, thickness: float) -> None:
+    def __init__(self, thickness: float, damping: float = WALL_DAMPING) -> None:
         super().__init__()
-        self.has_thickness = thickness > 0
+        self.has_thickness, self.damping = thickness > 0, damping
         if self.has_thickness:
             self.log_thickness = nn.Parameter(torch.tensor(float(thickness)).log())
             self.log_stiffness = nn.Parameter(torch.tensor(FIRST_STIFFNESS).log())
-            self.log_damping = nn.Parameter(torch.tensor(FIRST_DAMPING).log())
             self.log_most_friction = nn.Parameter(torch.tensor(FIRST_MOST_FRICTION).log())
 
     def slipping(self, friction: Float[Tensor, " contact"]) -> Float[Tensor, " contact"]:
@@ -86,10 +91,10 @@ class WallLayer(nn.Module):
         """
         if not self.has_thickness:
             return None
-        thickness, stiffness, damping = (x.exp().to(modulus) for x in (self.log_thickness, self.log_stiffness, self.log_damping))
+        thickness, stiffness = (x.exp().to(modulus) for x in (self.log_thickness, self.log_stiffness))
         per_mass = stiffness * modulus / (thickness * mass)
         depth = (thickness * spacing - relief).clamp(min=THINNEST * spacing).to(per_mass)
-        return torch.stack([depth, per_mass, 2.0 * damping * per_mass.sqrt()], dim=1)
+        return torch.stack([depth, per_mass, 2.0 * self.damping * per_mass.sqrt()], dim=1)
 
 
 class ElasticBodies(nn.Module):
@@ -102,6 +107,7 @@ class ElasticBodies(nn.Module):
         dim: dimension of space.
         wall_distance: distance at which walls stop nodes before training, in rest spacings.
         wall_layer: thickness of the elastic layer of walls before training, in rest spacings; 0 stands for no layer.
+        wall_damping: its damping at the wall, a fraction of the critical one.
         viscous: cells have a viscous stress, whose constant is learned; otherwise it is negligible.
         body_layer: thickness of the layer between bodies before training, in rest spacings; 0 stands for no layer.
     """
@@ -116,6 +122,7 @@ class ElasticBodies(nn.Module):
         dim: int,
         wall_distance: float = 0.0,
         wall_layer: float = 0.0,
+        wall_damping: float = WALL_DAMPING,
         viscous: bool = True,
         body_layer: float = 0.0,
     ) -> None:
@@ -124,7 +131,7 @@ class ElasticBodies(nn.Module):
         self.constants = nn.ModuleDict({m: Constants(count, viscous) for m, count in param_channels.items()})
         self.log_friction = nn.ParameterDict({m: torch.zeros(()) for m in param_channels})
         self.wall_distance = nn.ParameterDict({m: torch.tensor(float(wall_distance)) for m in param_channels})
-        self.wall_layer = nn.ModuleDict({m: WallLayer(wall_layer) for m in param_channels})
+        self.wall_layer = nn.ModuleDict({m: WallLayer(wall_layer, wall_damping) for m in param_channels})
         self.body_layer = nn.ModuleDict({m: BodyLayer(body_layer, count, LOGARITHM_SCALE) for m, count in param_channels.items()})
         self.register_buffer("acceleration_unit", torch.ones((), dtype=torch.float64))
         self.register_buffer("spacing", torch.ones((), dtype=torch.float64))
