@@ -26,7 +26,7 @@ MAX_CACHED = 64
 FIRST_STIFFNESS, FIRST_MOST_FRICTION = 0.5, 0.7
 """Stiffness and largest friction of the layer of walls before training."""
 WALL_DAMPING = 0.6
-"""Damping of the layer of walls at the wall, as a fraction of the critical one. Elastomers that fall level then bounce as high as in the material point method."""
+"""Damping of the layer of walls at the wall, as a fraction of the critical one. Elastomers that fall level bounce with it as in the material point method."""
 THINNEST = 0.01
 """Least thickness of the layer of walls, in rest spacings."""
 ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "relief", "cell_index", "attached_index", "corner_index", "corner")
