@@ -16,6 +16,7 @@ from gpe_pl.benchmarks.acceptance.bodies import bounce_height, deformation_ratio
 from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import generate_trajectory
 from gpe_pl.metrics.bodies import Bodies
+from gpe_pl.nn.elastic_bodies import WALL_DAMPING
 from gpe_pl.nn.elastic_motion import Cells, Constants, Walls, elastic_motion
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.solvers.fem import FEM
@@ -106,7 +107,7 @@ def test_with_the_solvers_constants_a_block_bounces_as_in_the_material_point_met
     normal[:, 1] = 1.0
     stiffness = 0.55 * (lam + 2.0 * mu) / 2.3
     bounces = {}
-    for name, layer in {"layer": [2.3 * spacing, stiffness, 0.25 * math.sqrt(stiffness)], "plane": [0.0, 0.0, 0.0]}.items():
+    for name, layer in {"layer": [2.3 * spacing, stiffness, 2.0 * WALL_DAMPING * math.sqrt(stiffness)], "plane": [0.0, 0.0, 0.0]}.items():
         pos, vel = torch.from_numpy(truth.pos[0].astype(np.float64)), dt * first.double()
         gravity = torch.tensor([0.0, -9.81 * dt**2], dtype=torch.float64).expand_as(pos)
         path = [pos]
