@@ -297,7 +297,8 @@ def _stopped(velocity: Tensor, moved: Tensor, normal: Tensor, gap: Tensor, frict
     along = (velocity * normal).sum(dim=1)
     distance = gap + (moved * normal).sum(dim=1)
     thickness, stiffness, damping = layer.unbind(dim=1)
-    depth = (1.0 - distance / torch.where(thickness > 0, thickness, torch.inf)).clamp(min=0.0)
+    has_layer = thickness > 0
+    depth = torch.where(has_layer, 1.0 - distance / torch.where(has_layer, thickness, 1.0), 0.0).clamp(min=0.0)
     soft = step * (stiffness * thickness * depth.square() - damping * depth * along.clamp(max=0.0))
     change = torch.maximum(-distance / step - along, soft)
     hits = (change > 0) & (normal != 0).any(dim=1)

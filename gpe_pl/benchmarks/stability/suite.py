@@ -97,7 +97,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
     """
     parts = FinishedParts(folder / PARTS)
     records: list[dict[str, Any]] = []
-    checkpoints = {name: _checkpoints(spec, settings) for name, spec in specs.items()}  # read once: runs may finish while the suite runs
+    checkpoints = {name: _checkpoints(spec, settings) for name, spec in specs.items()}  # looked up once: runs may finish meanwhile
     untested = [name for name, models in checkpoints.items() if not models]
     tested = [(name, specs[name], models) for name, models in checkpoints.items() if models]
     if min(settings.num_workers, len(tested)) > 1:
