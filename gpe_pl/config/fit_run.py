@@ -242,6 +242,7 @@ class FitRun:
             stride=self.stride,
             unroll_steps=self.training.unroll_steps or 1,
             others=self.others,
+            reads_relief=bool(self.cfg.model.get("wall_layer", 0)),
         )
 
     @property

@@ -32,8 +32,8 @@ UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "graph.num_levels": ("graph.mesh", lambda mesh: not mesh),
     "dimension": ("data.size", lambda size: size == "imported"),
 }
-"""Keys that are unused for some values of another key, with that key and the test of its value. The value 0 is always allowed, because it switches the setting
-off."""
+"""Keys that are unused for some values of another key, with that key and the test of its value. They are also unused where that key is. The value 0 is always
+allowed, because it switches the setting off."""
 
 
 def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
@@ -47,9 +47,11 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
         key, _, value = override.lstrip("+").partition("=")
         if _is_in_lookup(key) and not key.startswith(OF_SWEEPS) and not _is_read(cfg, key):
             return f"{key}={value}: has no effect, because no other setting takes its value here; leave it out"
-        other, is_unread = UNREAD.get(key, ("", bool))
-        if other and value != "0" and is_unread(decides := OmegaConf.select(cfg, other)):
-            return f"{key}={value}: has no effect with {other}={'null' if decides is None else decides}; leave out one of the two"
+        reader = key
+        while value != "0" and reader in UNREAD:
+            reader, is_unread = UNREAD[reader]
+            if is_unread(decides := OmegaConf.select(cfg, reader)):
+                return f"{key}={value}: has no effect with {reader}={'null' if decides is None else decides}; leave out one of the two"
     return ""
 
 

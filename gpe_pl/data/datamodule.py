@@ -162,6 +162,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         unroll_steps: number of steps of an unroll with gradients; see ``WindowDataset``.
         others: folders of further data sets, each with a stride. They may have another spacing and frame interval if ``graph.scales`` allows it. The metadata
             are those of the first, but the connectivity radius is the largest one in spacings.
+        reads_relief: see ``GraphBuilder``.
 
     Attributes:
         push_forward: settings of the push-forward trick; None if it is not used. In steps with push-forward, batches contain starts of unrolls instead of
@@ -192,6 +193,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         stride: int = 1,
         unroll_steps: int = 1,
         others: Sequence[tuple[Path, int]] = (),
+        reads_relief: bool = True,
     ) -> None:
         super().__init__()
         self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
@@ -200,7 +202,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         self.push_forward: PushForward | None = None
         self.parts = [_Part.opened(Path(folder), own, graph.history) for folder, own in ((root, stride), *others)]
         self.metadata = _common(self.parts)
-        self.builder = GraphBuilder(graph, self.metadata)
+        self.builder = GraphBuilder(graph, self.metadata, reads_relief=reads_relief)
         for part in self.parts:
             noise.check(part.metadata, part.velocity_unit)
         unit = self.parts[0].velocity_unit

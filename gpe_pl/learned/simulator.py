@@ -594,6 +594,6 @@ class LearnedSimulator(nn.Module):
             simulator._check_values()
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(
-                f"{path}: not a checkpoint of gpe_pl or one of another model ({reason(error)}); take another one of the run, such as last.ckpt"
+                f"{path}: not a checkpoint of gpe_pl or one of another model ({reason(error)}); take last.ckpt, or train again with this version"
             ) from None
         return simulator.to(device).eval()

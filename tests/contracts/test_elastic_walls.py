@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from gpe_pl.export.program import EVERYTHING
 from gpe_pl.geometry.relief import reliefs
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.graphs.contacts import corners_near_edges, oriented_edges
@@ -97,7 +98,8 @@ def test_a_model_without_a_layer_of_walls_skips_the_relief(monkeypatch: pytest.M
     assert not thin.builder(state)["solid"].relief.any()
     with torch.no_grad():
         torch.testing.assert_close(thin(thin.builder(state)).frame_velocity["solid"], computed, rtol=0, atol=0)
-        found = thin.configured(skips=thin.skips).next_states([state])[0]
+        found = thin.next_states([state])[0]
+    assert not thin.configured(skips=EVERYTHING).builder.reads_relief and not thin.builder.at(2.0 * scenes.SPACING, DT).reads_relief
     assert torch.equal(cast(State, found).pos, cast(State, expected).pos)
     with pytest.raises(AssertionError, match="the relief was computed"):
         thick.builder(state)

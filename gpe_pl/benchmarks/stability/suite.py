@@ -52,6 +52,10 @@ GROUPS = {
 }
 
 
+class ReplacedError(GpeError, ValueError):
+    """Raised when a checkpoint is replaced while the suite runs; the message names it."""
+
+
 class NothingToTestError(GpeError, ValueError):
     """Raised when there is no model for any data set, or two models of a data set have one name; the message says what to do."""
 
@@ -94,6 +98,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
     Raises:
         NothingToTestError: no data set has a model, or two models of a data set have one name.
         CheckpointError: a checkpoint of ``settings`` cannot be loaded. It is raised before the first test.
+        ReplacedError: a checkpoint was replaced while the suite ran.
     """
     parts = FinishedParts(folder / PARTS)
     records: list[dict[str, Any]] = []
@@ -114,19 +119,19 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
             "suite.runs or suite.checkpoints"
         )
     for name, _, models in tested:
-        for label, path in models.items():
-            _write_verdict(path, [r for r in records if (r["domain"], r["model"]) == (name, label)], folder)
+        for label, (path, checksum) in models.items():
+            _write_verdict(path, checksum, [r for r in records if (r["domain"], r["model"]) == (name, label)], folder)
     parts.clear()
     return records, report(records, untested)
 
 
-def _write_verdict(path: Path, records: Sequence[dict[str, Any]], folder: Path) -> None:
+def _write_verdict(path: Path, checksum: str, records: Sequence[dict[str, Any]], folder: Path) -> None:
     """Write the verdict on a checkpoint. Tests that do not apply are left out."""
     checks = [
         Check(r["test"], r["status"] == "passed", r["measured"], "", r["criterion"]) for r in records if r["status"] != "not_applicable"
     ]
     target = folder / f"{path.stem}{verdicts.suffix('stability')}" if path.parent == FOLDER else verdicts.path_beside(path, "stability")
-    verdicts.write(target, verdicts.added(target, Verdict(verdicts.checksum(path), checks), {r["test"] for r in records}))
+    verdicts.write(target, verdicts.added(target, Verdict(checksum, checks), {r["test"] for r in records}))
 
 
 def _show_progress() -> None:
@@ -135,11 +140,14 @@ def _show_progress() -> None:
 
 
 def _test_domain(
-    name: str, spec: DatasetSpec, checkpoints: dict[str, Path], settings: Settings, parts: FinishedParts
+    name: str, spec: DatasetSpec, checkpoints: dict[str, tuple[Path, str]], settings: Settings, parts: FinishedParts
 ) -> list[dict[str, Any]]:
-    """Return the records of all models of a data set, given their checkpoints by name."""
+    """Return the records of all models of a data set, given their checkpoints and the checksums of these by name."""
     torch.set_num_threads(settings.num_threads)
-    models = {label: of_stored_frames(path) for label, path in checkpoints.items()}
+    for path, checksum in checkpoints.values():
+        if verdicts.checksum(path) != checksum:
+            raise ReplacedError(f"{path}: was replaced while the suite ran; start it again when no training writes there")
+    models = {label: of_stored_frames(path) for label, (path, _) in checkpoints.items()}
     return [record for subject in subjects(name, spec, models, settings) for record in test(subject, settings.tests, parts)]
 
 
@@ -238,8 +246,8 @@ def is_gating(simulator: LearnedSimulator, gating: dict[str, str]) -> bool:
     return bool(gating) and all(own.get(key) == value for key, value in gating.items())
 
 
-def _checkpoints(spec: DatasetSpec, settings: Settings) -> dict[str, Path]:
-    """Return the checkpoints of all models of a data set by name. Each has been loaded once."""
+def _checkpoints(spec: DatasetSpec, settings: Settings) -> dict[str, tuple[Path, str]]:
+    """Return the checkpoints of all models of a data set and their checksums, by name. Each checkpoint has been loaded once."""
     found = {name: checkpoint_path(run.folder) for name, (_, run) in trained_on(spec, runs_in(settings.runs)).items()}
     for checkpoint in settings.checkpoints:
         metadata, label = of_stored_frames(checkpoint).builder.metadata, checkpoint_label(checkpoint)
@@ -249,7 +257,7 @@ def _checkpoints(spec: DatasetSpec, settings: Settings) -> dict[str, Path]:
                     f"two models of {spec.name} are called {label}; copy one of the checkpoints to a file of another name"
                 )
             found[label] = checkpoint_path(checkpoint)
-    return found
+    return {label: (path, verdicts.checksum(path)) for label, path in found.items()}
 
 
 def failures(records: Sequence[dict[str, Any]]) -> list[str]:

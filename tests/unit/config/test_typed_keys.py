@@ -32,6 +32,7 @@ def unresolved(*overrides: str, hydra_config: bool = False) -> DictConfig:
         ("recipe=paper", "training.warmup_steps=10", "training.schedule=exponential"),
         ("recipe=paper", "training.push_correction=0.2", "training.push_fraction=0.0"),
         ("model=gns", "graph.num_levels=2", "graph.mesh=False"),
+        ("model=gpe", "model.wall_damping=0.3", "model.wall_layer=0.0"),
         ("data=imported", "dimension=3", "data.size=imported"),
         ("model=gns", "size.comparison.budget_minutes=3", "no other setting"),
         ("experiment=table1", "size.comparison.tuning_minutes=3", "no other setting"),
@@ -40,6 +41,13 @@ def unresolved(*overrides: str, hydra_config: bool = False) -> DictConfig:
 def test_what_nothing_reads_is_refused(beside: str, typed: str, because: str) -> None:
     refusal = without_effect(unresolved(beside, typed), [beside, typed])
     assert refusal.startswith(f"{typed}: has no effect") and because in refusal
+
+
+def test_what_only_unread_keys_read_is_refused() -> None:
+    law, typed = ("data=elastomer", "model=gpe_tuned", "law=elastic"), "model.wall_damping=0.3"
+    assert without_effect(unresolved(*law, typed), [typed]) == ""
+    refusal = without_effect(unresolved(*law, typed, "model.elastic=false"), [typed])
+    assert refusal == "model.wall_damping=0.3: has no effect with model.elastic=False; leave out one of the two"
 
 
 @pytest.mark.parametrize(

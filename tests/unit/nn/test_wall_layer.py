@@ -59,6 +59,14 @@ def test_push_and_damping_grow_with_the_depth(compiled: bool, speed: float, damp
         assert change == pytest.approx(h * (stiffness * thickness * depth**2 + damping * depth * damped), rel=1e-9, abs=1e-12)
 
 
+def test_a_layer_without_thickness_does_nothing() -> None:
+    layer, h = torch.tensor([[0.0, 3.0, 5.0]], dtype=torch.float64), 0.1
+    velocity, normal = torch.tensor([[0.0, -0.01]], dtype=torch.float64), torch.tensor([[0.0, 1.0]], dtype=torch.float64)
+    none, step = torch.zeros(1, dtype=torch.float64), torch.tensor([h], dtype=torch.float64)
+    new = _stopped(velocity, torch.zeros_like(velocity), normal, none + 1.0, none, layer, step)
+    assert torch.equal(new, velocity) and _wall_contact(1.0, -0.01, layer[0].numpy(), h) == (0.0, False)
+
+
 def test_without_thickness_there_is_no_layer() -> None:
     layer = WallLayer(0.0)
     assert layer.of_nodes(torch.zeros(3), MODULUS, MASS, SPACING) is None

@@ -16,7 +16,7 @@ from gpe_pl.benchmark import benchmark
 from gpe_pl.benchmarks.stability import conservation, geometry, horizon, inputs, invariances, precision, suite
 from gpe_pl.benchmarks.stability.horizon import energy, growth_rate, separation, valid_steps
 from gpe_pl.benchmarks.stability.subject import Outcome, StressTest, Subject
-from gpe_pl.benchmarks.stability.suite import GROUPS, NothingToTestError, Settings, figures, is_gating, run
+from gpe_pl.benchmarks.stability.suite import GROUPS, NothingToTestError, ReplacedError, Settings, figures, is_gating, run
 from gpe_pl.benchmarks.stability.suite import test as run_tests
 from gpe_pl.benchmarks.trained import Case, model_label, trained_on
 from gpe_pl.config.datasets import dataset
@@ -359,3 +359,24 @@ def test_a_run_that_finishes_during_the_suite_takes_no_part(
     with pytest.raises(CheckpointError, match="late/checkpoints/best.ckpt: "):
         run(settings, {"sand": spec}, tmp_path / "results")
     assert len(late) == 1
+
+
+def test_a_checkpoint_that_is_replaced_during_the_suite_gets_no_verdict(
+    spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulator, checkpoint = subject(spec, scenes, **SHIPPED).simulator, tmp_path / "own.ckpt"
+    simulator.save(checkpoint)
+    settings = Settings({"sand": Case([])}, [], [str(checkpoint)], SHIPPED, 1, [1.0], 5, [1])
+    looked_up = suite._checkpoints
+
+    def replacing(*args: Any) -> Any:
+        found = looked_up(*args)
+        simulator.acceleration_std.fill_(2.0)
+        simulator.save(checkpoint)
+        return found
+
+    monkeypatch.setattr(suite, "_outcome", lambda *_: Outcome(True, "as it should be"))
+    monkeypatch.setattr(suite, "_checkpoints", replacing)
+    with pytest.raises(ReplacedError, match=r"own.ckpt: was replaced while the suite ran"):
+        run(settings, {"sand": spec}, tmp_path / "results")
+    assert not [*tmp_path.glob("*.json")]
