@@ -23,7 +23,7 @@ KEPT = 2
 @no_type_check
 def move_bodies(
     constants, acceleration, gravity, mass, held, body_pos, velocity, wall_normal, wall_gap, friction, wall_layer, corner_index, corner,
-    corner_friction, touching, way, touch, nodes, gradient, volume, rate, cell_start, node_start, units, limits, moved, at_end, stress,
+    corner_friction, touching, way, touch, nodes, gradient, volume, rate, cell_start, node_start, units, limits, retries, moved, at_end, stress,
 ):  # fmt: skip
     """Compute the motion of the bodies of one material in all scenes of a graph.
 
@@ -36,11 +36,12 @@ def move_bodies(
         body_pos, velocity, corner_index, corner: entries of the graph, see ``graphs.builder``.
         wall_normal, wall_gap, friction, wall_layer: of the walls of nodes, see ``elastic_motion.Walls``; zeros stand for no layer.
         corner_friction: Coulomb coefficient of each corner [pair].
-        touching, way, touch: pairs of nodes of different bodies, see ``elastic_touch.Touching``; ``touch`` is softened in place.
+        touching, way, touch: pairs of nodes of different bodies, see ``elastic_touch.Touching``.
         nodes, gradient, volume, rate: of cells, see ``elastic_motion.Cells``.
         cell_start, node_start: first cell and node of each scene, and their numbers [scene + 1].
         units: units of accelerations, of length, and of stresses.
         limits: largest number of substeps, length of a substep as a fraction of the largest one that is stable, and two constants of ``soften_touching``.
+        retries: factors of the law in further tries, see ``elastic_motion.RETRIES``.
         moved: accelerations without gravity that move the nodes as far [node, dim]; a result.
         at_end: velocities at the end of the frame [node, dim] in m/frame; a result.
         stress: Cauchy stress at the end of the frame [node, component], or without rows; a result.
@@ -72,17 +73,30 @@ def move_bodies(
     number = np.empty(len(node_start) - 1, np.int64)
     for s in range(len(number)):
         number[s] = _soften(pos, lam, mu, eta, nodes, gradient, rate, cell_start[s], cell_start[s + 1], limits[0], limits[1])
-        for n in range(node_start[s], node_start[s + 1]):
-            layer[n, 0], layer[n, 1] = wall_layer[n, 0], min(wall_layer[n, 1], 0.5 * float(number[s]) ** 2)
-            layer[n, 2] = min(wall_layer[n, 2], 0.5 * number[s])
     pair_start, touch_start = _first_of_scenes(corner_index, node_start), _first_of_scenes(touching, node_start)
-    soften_touching(touching, way, touch, mass, vel, number, node_start, touch_start, limits[2], limits[3])
     path, speed_path, pushed = np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim))
-    contacts = np.zeros((KEPT, len(corner), 6))
-    move_forward(
-        pos, vel, forcing, weights, lam, mu, eta, normal, gap, friction, layer, point, corner_friction, way, touch, corner_index, touching, nodes,
-        gradient, volume, cell_start, node_start, pair_start, touch_start, number, path, speed_path, pushed, contacts, at_end,
-    )  # fmt: skip
+    contacts, soft = np.zeros((KEPT, len(corner), 6)), np.empty_like(touch)
+    for attempt in range(len(retries) + 1):
+        for s in range(len(number)):
+            for n in range(node_start[s], node_start[s + 1]):
+                layer[n, 0], layer[n, 1] = wall_layer[n, 0], min(wall_layer[n, 1], 0.5 * float(number[s]) ** 2)
+                layer[n, 2] = min(wall_layer[n, 2], 0.5 * number[s])
+        soft[:] = touch
+        soften_touching(touching, way, soft, mass, vel, number, node_start, touch_start, limits[2], limits[3])
+        move_forward(
+            pos, vel, forcing, weights, lam, mu, eta, normal, gap, friction, layer, point, corner_friction, way, soft, corner_index, touching, nodes,
+            gradient, volume, cell_start, node_start, pair_start, touch_start, number, path, speed_path, pushed, contacts, at_end,
+        )  # fmt: skip
+        if attempt == len(retries):
+            break
+        is_any = False
+        for s in range(len(number)):
+            if _is_unstable(pos, vel, forcing, path[number[s] % KEPT], at_end, volume, number[s], node_start, cell_start, s):
+                is_any, number[s] = True, limits[0]
+                for cell in range(cell_start[s], cell_start[s + 1]):
+                    lam[cell], mu[cell], eta[cell] = lam[cell] * retries[attempt], mu[cell] * retries[attempt], eta[cell] * retries[attempt]
+        if not is_any:
+            break
     for s in range(len(number)):
         last = path[number[s] % KEPT]
         for n in range(node_start[s], node_start[s + 1]):
@@ -92,6 +106,26 @@ def move_bodies(
                 pos[n, a] += way
     if len(stress):
         _write_stress(pos, lam, mu, nodes, gradient, volume, stress_unit, stress)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _is_unstable(pos, vel, forcing, last, at_end, volume, number, node_start, cell_start, s):
+    """Tell whether the substeps of a scene were too long, see ``elastic_motion._unstable``."""
+    dim, length = pos.shape[1], 0.0
+    if cell_start[s] == cell_start[s + 1]:
+        return False
+    for cell in range(cell_start[s], cell_start[s + 1]):
+        length += volume[cell].sum() ** (1.0 / dim) / (cell_start[s + 1] - cell_start[s])
+    before = pushed = after = 0.0
+    for n in range(node_start[s], node_start[s + 1]):
+        v = f = w = x = 0.0
+        for a in range(dim):
+            v, f, w, x = v + vel[n, a] ** 2, f + forcing[n, a] ** 2, w + at_end[n, a] ** 2, x + (last[n, a] - pos[n, a]) ** 2
+        if not math.isfinite(w) or not math.isfinite(x):
+            return True
+        before, pushed, after = max(before, v), max(pushed, f), max(after, w, x)
+    return math.sqrt(after) > math.sqrt(before) + math.sqrt(pushed) + number * length
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -43,6 +43,8 @@ MAX_SUBSTEPS = 96
 """Largest number of substeps in a frame. Cells that need more are softened."""
 STABLE = 0.7
 """Length of a substep as a fraction of the largest one that is proven to be stable at the start of the frame. Cells may stiffen within the frame."""
+RETRIES = (1.0, 1 / 16, 1 / 256, 0.0)
+"""Factors of the law in further tries with ``MAX_SUBSTEPS``, for scenes that were unstable: crushed cells can stiffen a hundredfold within a frame."""
 LOGARITHM_SCALE = 5.0
 """The logarithms of constants are this factor times their weights, so that training finds the constants within some hundred steps."""
 FIRST_GUESS = (10.0, 10.0, 0.1)
@@ -110,6 +112,13 @@ class Cells:
         nodes, gradient, volume, rate, scene, node_start = (np.ascontiguousarray(getattr(self, f.name).numpy()) for f in fields(self))
         return nodes, gradient, volume, rate, np.searchsorted(scene, np.arange(self.num_scenes + 1)), node_start
 
+    @cached_property
+    def length(self) -> Float[Tensor, " scene"]:
+        """Mean length of the cells of each scene [m], 0 in scenes without cells."""
+        of_cell = self.volume.sum(dim=1).pow(1.0 / self.gradient.shape[3])
+        total, count = of_cell.new_zeros(2, self.num_scenes).index_add_(1, self.scene, torch.stack([of_cell, torch.ones_like(of_cell)]))
+        return total / count.clamp(min=1.0)
+
     @property
     def num_scenes(self) -> int:
         return self.node_start.shape[0] - 1
@@ -176,7 +185,7 @@ class ElasticMotion(NamedTuple):
     Attributes:
         displacement: in m [node, dim].
         velocity: velocity at the end in m/frame [node, dim].
-        law: the law of each cell [cell], softened where ``MAX_SUBSTEPS`` would not suffice, and zero in torn cells.
+        law: the law of each cell [cell], softened where ``MAX_SUBSTEPS`` would not suffice or its scene was unstable, and zero in torn cells.
     """
 
     displacement: Float[Tensor, "node dim"]
@@ -218,14 +227,38 @@ def elastic_motion(
         forcing, axis_mass = torch.where(held, 0.0, forcing), torch.where(held, HEAVY, axis_mass)
         normal = torch.where(held.any(dim=1, keepdim=True), 0.0, normal)  # walls do not move a held node
     gap = walls.gap.clamp(min=0.0)  # a node behind a plane is not pushed out at once
-    layer = pos.new_zeros(len(pos), 3) if walls.layer is None else _stable_layer(walls.layer, number, cells)
-    of_node = number.repeat_interleave(cells.node_start.diff(), output_size=len(pos))
-    touching = (touching or Touching.nothing(pos)).softened(mass.double(), of_node, vel.double())
-    contacts = (normal, gap, walls.friction, layer, corners.point, corners.friction, touching.way, touching.law)
-    values = [t.double() for t in (pos, vel, forcing, axis_mass, *softened, *contacts)]
-    move: Any = _Motion.apply if works_on(*values) else plain_motion
-    displacement, velocity = move(*values, corners.nodes, touching.nodes, cells, number)
+    touching = touching or Touching.nothing(pos)
+    for factor in (*RETRIES, None):
+        layer = pos.new_zeros(len(pos), 3) if walls.layer is None else _stable_layer(walls.layer, number, cells)
+        of_node = number.repeat_interleave(cells.node_start.diff(), output_size=len(pos))
+        soft = touching.softened(mass.double(), of_node, vel.double())
+        contacts = (normal, gap, walls.friction, layer, corners.point, corners.friction, soft.way, soft.law)
+        values = [t.double() for t in (pos, vel, forcing, axis_mass, *softened, *contacts)]
+        move: Any = _Motion.apply if works_on(*values) else plain_motion
+        displacement, velocity = move(*values, corners.nodes, soft.nodes, cells, number)
+        unstable = _unstable(vel, forcing, displacement, velocity, cells, number)
+        if factor is None or not bool(unstable.any()):
+            break
+        number = torch.where(unstable, MAX_SUBSTEPS, number)
+        in_cell = torch.where(unstable, factor, 1.0).double()[cells.scene]
+        softened = (softened[0] * in_cell, softened[1] * in_cell, softened[2] * in_cell)
     return ElasticMotion(displacement, velocity, softened)
+
+
+@torch.no_grad()
+def _unstable(
+    vel: Tensor, forcing: Tensor, displacement: Tensor, last_velocity: Tensor, cells: Cells, number: Tensor
+) -> Bool[Tensor, " scene"]:
+    """Tell in which scenes substeps were too long: a node became faster than the start, the forcing, and one cell per substep explain."""
+    scene = torch.arange(cells.num_scenes, device=vel.device).repeat_interleave(cells.node_start.diff(), output_size=len(vel))
+
+    def fastest(way: Tensor) -> Tensor:
+        speed = way.double().norm(dim=1)
+        speed = torch.where(speed.isfinite(), speed, torch.inf)
+        return speed.new_zeros(cells.num_scenes).scatter_reduce_(0, scene, speed, "amax")
+
+    explained = fastest(vel) + fastest(forcing) + number * cells.length
+    return (cells.length > 0) & ~(torch.maximum(fastest(displacement), fastest(last_velocity)) <= explained)
 
 
 def _softened_law(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> tuple[Law, Int64[Tensor, " scene"]]:

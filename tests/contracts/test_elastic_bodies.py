@@ -25,6 +25,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.approximate import Repeating, Sleeping
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
+from gpe_pl.nn import elastic_bodies, elastic_motion
 from gpe_pl.nn.elastic_bodies import CellError, _found_once
 from gpe_pl.nn.elastic_motion import Cells
 from gpe_pl.rollout.containment import contain
@@ -88,6 +89,34 @@ def test_the_compiled_motion_equals_the_plain_one(
             expected = model.elastic_bodies(*inputs)
     for value, other in zip(found, expected, strict=True):
         torch.testing.assert_close(value["solid"], other["solid"], rtol=0, atol=tolerance * float(other["solid"].abs().max()))
+
+
+def test_the_compiled_motion_of_cells_that_are_crushed_within_a_frame_equals_the_plain_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulated = simulator(("solid",))
+    build, model = DoubleBuilder(simulated.builder.config, simulated.builder.metadata), cast(GPE, simulated.model).double()
+    graph = batched([build(bodies(seed, materials=("solid",))) for seed in (0, 1)])
+    store, num_nodes = graph["solid"], len(graph["solid"].pos)
+    still = {"solid": torch.zeros(num_nodes, 2, dtype=torch.float64)}
+    inputs = graph, still, {"solid": store.material_params.double()}, {"solid": store.mass}, False
+
+    def speeds() -> Tensor:
+        velocity: Tensor = model.elastic_bodies(*inputs).frame_velocity["solid"]
+        return velocity.norm(dim=1)
+
+    with torch.no_grad():
+        calm = speeds()
+        is_second = store.batch == 1
+        throw = torch.randn(num_nodes, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        store.velocity[is_second, 2:] = 20.0 * scenes.SPACING * throw[is_second]
+        found = speeds()
+        with unfused():
+            expected = speeds()
+        for module in (elastic_motion, elastic_bodies):
+            monkeypatch.setattr(module, "RETRIES", ())
+        unstable = speeds()
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6 * float(expected.max()))
+    assert not float(unstable[is_second].max()) < 1e6 * float(found.max())
+    torch.testing.assert_close(found[~is_second], calm[~is_second], rtol=0, atol=0)
 
 
 def test_scenes_with_and_without_cells_move_as_alone() -> None:

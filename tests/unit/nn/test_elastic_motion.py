@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
+import gpe_pl.nn.elastic_motion as elastic_motion_module
 from gpe_pl.nn.elastic_motion import MAX_SUBSTEPS, Cells, Walls, elastic_motion
 from gpe_pl.nn.elastic_touch import Touching
 from gpe_pl.nn.fused import unfused
@@ -379,6 +381,63 @@ def test_any_constants_keep_a_body_finite(kind: str) -> None:
             pos, vel = body.moved(pos, vel)
         assert torch.isfinite(pos).all() and torch.isfinite(vel).all()
         assert float(pos.std()) < 3 * before
+
+
+CRUSHING = [("triangles", 5.0), ("quadrilaterals", 8.0), ("tetrahedra", 3.0), ("hexahedra", 4.0)]
+"""Kinds of bodies, and the scale of random velocities in lengths of a cell per frame that crush their cells within the frame."""
+
+
+def crushed(kind: str, scale: float) -> tuple[Body, Tensor]:
+    """A body at rest and velocities that crush it within the frame."""
+    body = Body(kind)
+    return body, scale * SPACING * torch.randn(body.rest.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("plain", [False, True], ids=["compiled", "plain"])
+@pytest.mark.parametrize(("kind", "scale"), CRUSHING)
+def test_cells_that_are_crushed_within_a_frame_stay_finite(kind: str, scale: float, plain: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    body, vel = crushed(kind, scale)
+    with unfused() if plain else torch.enable_grad():
+        _, after = body.moved(body.rest, vel)
+        monkeypatch.setattr(elastic_motion_module, "RETRIES", ())
+        _, unstable = body.moved(body.rest, vel)
+    assert not float(unstable.abs().max()) < 1e6 * SPACING
+    assert float(after.norm(dim=1).max()) < 3 * float(vel.norm(dim=1).max())
+    momentum = [(body.mass[:, None] * v).sum(dim=0) for v in (vel, after)]
+    torch.testing.assert_close(*momentum, rtol=0, atol=1e-10)
+
+
+def test_a_body_that_was_unstable_moves_as_by_shorter_substeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    body, vel = crushed("triangles", 5.0)
+    found = body.moved(body.rest, vel)
+    monkeypatch.setattr(Cells, "substeps", lambda self, pos, law: (torch.tensor([MAX_SUBSTEPS]), torch.ones(len(law[0])).double()))
+    assert_close(found, body.moved(body.rest, vel), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("plain", [False, True], ids=["compiled", "plain"])
+def test_an_unstable_scene_changes_no_other_of_its_batch(plain: bool) -> None:
+    _, together = several("triangles")
+    scene = torch.arange(3).repeat_interleave(together["cells"].node_start.diff())
+    is_last = (scene == 2)[:, None]
+    faster = together | {"vel": torch.where(is_last, 400.0 * together["vel"], together["vel"])}
+    with unfused() if plain else torch.enable_grad():
+        for before, after in zip(motion(together), motion(faster), strict=True):
+            assert_close(before[~is_last[:, 0]], after[~is_last[:, 0]], rtol=0, atol=0)
+            assert bool(after.isfinite().all())
+
+
+@pytest.mark.parametrize(("kind", "scale"), CRUSHING)
+def test_gradients_of_an_unstable_scene_are_those_of_the_last_try(kind: str, scale: float) -> None:
+    body, vel = crushed(kind, scale)
+    gradients = []
+    for plain in (False, True):
+        start = vel.clone().requires_grad_()
+        with unfused() if plain else torch.enable_grad():
+            pos, _ = body.moved(body.rest, start)
+            (gradient,) = torch.autograd.grad(torch.sin(torch.arange(pos.numel()).double()) @ pos.flatten(), start)
+        gradients.append(gradient)
+    assert bool(gradients[0].isfinite().all())
+    assert_close(*gradients, rtol=0, atol=1e-6 * float(gradients[1].abs().max()))
 
 
 def test_a_batch_without_any_cell() -> None:
