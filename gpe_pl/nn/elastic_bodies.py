@@ -20,7 +20,7 @@ from gpe_pl.nn.elastic_bodies_kernels import move_bodies
 from gpe_pl.nn.elastic_motion import (
     LOGARITHM_SCALE,
     MAX_SUBSTEPS,
-    RETRIES,
+    SOFTER,
     STABLE,
     Cells,
     Constants,
@@ -272,7 +272,7 @@ class ElasticBodies(nn.Module):
             _array(torch.stack([lam, mu, eta], dim=1).double()), *map(_array, forces), held, _array(host["body_pos"]), _array(host["velocity"]),
             *map(_array, contacts), *map(_array, (touching.nodes, touching.way, touching.law)), *cells.arrays,
             tuple(float(unit) for unit in (self.acceleration_unit, self.spacing, self.stress_unit)),
-            (float(MAX_SUBSTEPS), STABLE, SHARE, APPROACH), np.array(RETRIES), moved, at_end, stress,
+            (float(MAX_SUBSTEPS), STABLE, SHARE, APPROACH), np.array(SOFTER), moved, at_end, stress,
         )  # fmt: skip
         found, velocity, tensions = (torch.from_numpy(a).to(mass.device) for a in (moved, at_end, stress))
         return found, velocity, tensions if with_stress else None

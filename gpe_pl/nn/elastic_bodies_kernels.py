@@ -23,7 +23,7 @@ KEPT = 2
 @no_type_check
 def move_bodies(
     constants, acceleration, gravity, mass, held, body_pos, velocity, wall_normal, wall_gap, friction, wall_layer, corner_index, corner,
-    corner_friction, touching, way, touch, nodes, gradient, volume, rate, cell_start, node_start, units, limits, retries, moved, at_end, stress,
+    corner_friction, touching, way, touch, nodes, gradient, volume, rate, cell_start, node_start, units, limits, softer, moved, at_end, stress,
 ):  # fmt: skip
     """Compute the motion of the bodies of one material in all scenes of a graph.
 
@@ -41,7 +41,7 @@ def move_bodies(
         cell_start, node_start: first cell and node of each scene, and their numbers [scene + 1].
         units: units of accelerations, of length, and of stresses.
         limits: largest number of substeps, length of a substep as a fraction of the largest one that is stable, and two constants of ``soften_touching``.
-        retries: factors of the law in further tries, see ``elastic_motion.RETRIES``.
+        softer: factors of the law of unstable scenes, see ``elastic_motion.SOFTER``.
         moved: accelerations without gravity that move the nodes as far [node, dim]; a result.
         at_end: velocities at the end of the frame [node, dim] in m/frame; a result.
         stress: Cauchy stress at the end of the frame [node, component], or without rows; a result.
@@ -76,7 +76,8 @@ def move_bodies(
     pair_start, touch_start = _first_of_scenes(corner_index, node_start), _first_of_scenes(touching, node_start)
     path, speed_path, pushed = np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim)), np.empty((KEPT, num_nodes, dim))
     contacts, soft = np.zeros((KEPT, len(corner), 6)), np.empty_like(touch)
-    for attempt in range(len(retries) + 1):
+    first, level, is_done = (lam.copy(), mu.copy(), eta.copy()), np.zeros(len(number), np.int64), False
+    while not is_done:
         for s in range(len(number)):
             for n in range(node_start[s], node_start[s + 1]):
                 layer[n, 0], layer[n, 1] = wall_layer[n, 0], min(wall_layer[n, 1], 0.5 * float(number[s]) ** 2)
@@ -87,16 +88,16 @@ def move_bodies(
             pos, vel, forcing, weights, lam, mu, eta, normal, gap, friction, layer, point, corner_friction, way, soft, corner_index, touching, nodes,
             gradient, volume, cell_start, node_start, pair_start, touch_start, number, path, speed_path, pushed, contacts, at_end,
         )  # fmt: skip
-        if attempt == len(retries):
-            break
-        is_any = False
+        is_done = True
         for s in range(len(number)):
-            if _is_unstable(pos, vel, forcing, path[number[s] % KEPT], at_end, volume, number[s], node_start, cell_start, s):
-                is_any, number[s] = True, limits[0]
+            is_longest = number[s] == int(limits[0])
+            if is_longest and level[s] + 1 == len(softer):
+                continue
+            if _is_unstable(pos, vel, forcing, layer, path[number[s] % KEPT], at_end, volume, number[s], node_start, cell_start, s):
+                is_done, level[s], number[s] = False, level[s] + int(is_longest), int(limits[0])
                 for cell in range(cell_start[s], cell_start[s + 1]):
-                    lam[cell], mu[cell], eta[cell] = lam[cell] * retries[attempt], mu[cell] * retries[attempt], eta[cell] * retries[attempt]
-        if not is_any:
-            break
+                    factor = softer[level[s]]
+                    lam[cell], mu[cell], eta[cell] = first[0][cell] * factor, first[1][cell] * factor, first[2][cell] * factor
     for s in range(len(number)):
         last = path[number[s] % KEPT]
         for n in range(node_start[s], node_start[s + 1]):
@@ -110,22 +111,22 @@ def move_bodies(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _is_unstable(pos, vel, forcing, last, at_end, volume, number, node_start, cell_start, s):
+def _is_unstable(pos, vel, forcing, layer, last, at_end, volume, number, node_start, cell_start, s):
     """Tell whether the substeps of a scene were too long, see ``elastic_motion._unstable``."""
     dim, length = pos.shape[1], 0.0
     if cell_start[s] == cell_start[s + 1]:
         return False
     for cell in range(cell_start[s], cell_start[s + 1]):
         length += volume[cell].sum() ** (1.0 / dim) / (cell_start[s + 1] - cell_start[s])
-    before = pushed = after = 0.0
+    before = pushed = after = thickest = 0.0
     for n in range(node_start[s], node_start[s + 1]):
         v = f = w = x = 0.0
         for a in range(dim):
             v, f, w, x = v + vel[n, a] ** 2, f + forcing[n, a] ** 2, w + at_end[n, a] ** 2, x + (last[n, a] - pos[n, a]) ** 2
         if not math.isfinite(w) or not math.isfinite(x):
             return True
-        before, pushed, after = max(before, v), max(pushed, f), max(after, w, x)
-    return math.sqrt(after) > math.sqrt(before) + math.sqrt(pushed) + number * length
+        before, pushed, after, thickest = max(before, v), max(pushed, f), max(after, w, x), max(thickest, layer[n, 0])
+    return math.sqrt(after) > math.sqrt(before) + math.sqrt(pushed) + number * (length + thickest)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -43,8 +43,8 @@ MAX_SUBSTEPS = 96
 """Largest number of substeps in a frame. Cells that need more are softened."""
 STABLE = 0.7
 """Length of a substep as a fraction of the largest one that is proven to be stable at the start of the frame. Cells may stiffen within the frame."""
-RETRIES = (1.0, 1 / 16, 1 / 256, 0.0)
-"""Factors of the law in further tries with ``MAX_SUBSTEPS``, for scenes that were unstable: crushed cells can stiffen a hundredfold within a frame."""
+SOFTER = (1.0, 1 / 16, 1 / 256, 0.0)
+"""Factors of the law of a scene that is unstable even with ``MAX_SUBSTEPS``, in this order. Cells that are crushed stiffen a hundredfold within a frame."""
 LOGARITHM_SCALE = 5.0
 """The logarithms of constants are this factor times their weights, so that training finds the constants within some hundred steps."""
 FIRST_GUESS = (10.0, 10.0, 0.1)
@@ -228,7 +228,8 @@ def elastic_motion(
         normal = torch.where(held.any(dim=1, keepdim=True), 0.0, normal)  # walls do not move a held node
     gap = walls.gap.clamp(min=0.0)  # a node behind a plane is not pushed out at once
     touching = touching or Touching.nothing(pos)
-    for factor in (*RETRIES, None):
+    first, level = softened, torch.zeros_like(number)
+    while True:
         layer = pos.new_zeros(len(pos), 3) if walls.layer is None else _stable_layer(walls.layer, number, cells)
         of_node = number.repeat_interleave(cells.node_start.diff(), output_size=len(pos))
         soft = touching.softened(mass.double(), of_node, vel.double())
@@ -236,29 +237,31 @@ def elastic_motion(
         values = [t.double() for t in (pos, vel, forcing, axis_mass, *softened, *contacts)]
         move: Any = _Motion.apply if works_on(*values) else plain_motion
         displacement, velocity = move(*values, corners.nodes, soft.nodes, cells, number)
-        unstable = _unstable(vel, forcing, displacement, velocity, cells, number)
-        if factor is None or not bool(unstable.any()):
-            break
-        number = torch.where(unstable, MAX_SUBSTEPS, number)
-        in_cell = torch.where(unstable, factor, 1.0).double()[cells.scene]
-        softened = (softened[0] * in_cell, softened[1] * in_cell, softened[2] * in_cell)
-    return ElasticMotion(displacement, velocity, softened)
+        again = _unstable(vel, forcing, layer, displacement, velocity, cells, number)
+        again &= (number < MAX_SUBSTEPS) | (level + 1 < len(SOFTER))
+        if not bool(again.any()):
+            return ElasticMotion(displacement, velocity, softened)
+        level = level + (again & (number == MAX_SUBSTEPS))
+        number = torch.where(again, MAX_SUBSTEPS, number)
+        factor = first[0].new_tensor(SOFTER)[level][cells.scene]
+        softened = (first[0] * factor, first[1] * factor, first[2] * factor)
 
 
 @torch.no_grad()
 def _unstable(
-    vel: Tensor, forcing: Tensor, displacement: Tensor, last_velocity: Tensor, cells: Cells, number: Tensor
+    vel: Tensor, forcing: Tensor, layer: Tensor, displacement: Tensor, last_velocity: Tensor, cells: Cells, number: Tensor
 ) -> Bool[Tensor, " scene"]:
-    """Tell in which scenes substeps were too long: a node became faster than the start, the forcing, and one cell per substep explain."""
+    """Tell in which scenes substeps were too long: a node became faster than start, forcing, and one cell and one layer per substep explain."""
     scene = torch.arange(cells.num_scenes, device=vel.device).repeat_interleave(cells.node_start.diff(), output_size=len(vel))
 
-    def fastest(way: Tensor) -> Tensor:
-        speed = way.double().norm(dim=1)
-        speed = torch.where(speed.isfinite(), speed, torch.inf)
-        return speed.new_zeros(cells.num_scenes).scatter_reduce_(0, scene, speed, "amax")
+    def largest(x: Tensor) -> Tensor:
+        size = x.double().norm(dim=1)
+        size = torch.where(size.isfinite(), size, torch.inf)
+        return size.new_zeros(cells.num_scenes).scatter_reduce_(0, scene, size, "amax")
 
-    explained = fastest(vel) + fastest(forcing) + number * cells.length
-    return (cells.length > 0) & ~(torch.maximum(fastest(displacement), fastest(last_velocity)) <= explained)
+    explained = largest(vel) + largest(forcing) + number * (cells.length + largest(layer[:, :1]))
+    reached = torch.maximum(largest(displacement), largest(last_velocity))
+    return (cells.length > 0) & ((reached > explained) | reached.isinf())
 
 
 def _softened_law(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> tuple[Law, Int64[Tensor, " scene"]]:
