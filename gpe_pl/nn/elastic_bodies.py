@@ -270,7 +270,7 @@ class ElasticBodies(nn.Module):
         )
         move_bodies(
             _array(torch.stack([lam, mu, eta], dim=1).double()), *map(_array, forces), held, _array(host["body_pos"]), _array(host["velocity"]),
-            *map(_array, contacts), *map(_array, (touching.nodes, touching.way, touching.law)), *cells.arrays,
+            *map(_array, contacts), *map(_array, (touching.nodes, touching.way, touching.law)), *cells.arrays, _array(cells.length),
             tuple(float(unit) for unit in (self.acceleration_unit, self.spacing, self.stress_unit)),
             (float(MAX_SUBSTEPS), STABLE, SHARE, APPROACH), np.array(SOFTER), moved, at_end, stress,
         )  # fmt: skip

@@ -23,7 +23,8 @@ KEPT = 2
 @no_type_check
 def move_bodies(
     constants, acceleration, gravity, mass, held, body_pos, velocity, wall_normal, wall_gap, friction, wall_layer, corner_index, corner,
-    corner_friction, touching, way, touch, nodes, gradient, volume, rate, cell_start, node_start, units, limits, softer, moved, at_end, stress,
+    corner_friction, touching, way, touch, nodes, gradient, volume, rate, cell_start, node_start, length, units, limits, softer, moved,
+    at_end, stress,
 ):  # fmt: skip
     """Compute the motion of the bodies of one material in all scenes of a graph.
 
@@ -39,6 +40,7 @@ def move_bodies(
         touching, way, touch: pairs of nodes of different bodies, see ``elastic_touch.Touching``.
         nodes, gradient, volume, rate: of cells, see ``elastic_motion.Cells``.
         cell_start, node_start: first cell and node of each scene, and their numbers [scene + 1].
+        length: mean length of the cells of each scene [scene], see ``elastic_motion.Cells``.
         units: units of accelerations, of length, and of stresses.
         limits: largest number of substeps, length of a substep as a fraction of the largest one that is stable, and two constants of ``soften_touching``.
         softer: factors of the law of unstable scenes, see ``elastic_motion.SOFTER``.
@@ -93,7 +95,8 @@ def move_bodies(
             is_longest = number[s] == int(limits[0])
             if is_longest and level[s] + 1 == len(softer):
                 continue
-            if _is_unstable(pos, vel, forcing, layer, path[number[s] % KEPT], at_end, volume, number[s], node_start, cell_start, s):
+            first_node, end = node_start[s], node_start[s + 1]
+            if length[s] and _is_unstable(pos, vel, forcing, layer, path[number[s] % KEPT], at_end, length[s], number[s], first_node, end):
                 is_done, level[s], number[s] = False, level[s] + int(is_longest), int(limits[0])
                 for cell in range(cell_start[s], cell_start[s + 1]):
                     factor = softer[level[s]]
@@ -111,17 +114,12 @@ def move_bodies(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _is_unstable(pos, vel, forcing, layer, last, at_end, volume, number, node_start, cell_start, s):
-    """Tell whether the substeps of a scene were too long, see ``elastic_motion._unstable``."""
-    dim, length = pos.shape[1], 0.0
-    if cell_start[s] == cell_start[s + 1]:
-        return False
-    for cell in range(cell_start[s], cell_start[s + 1]):
-        length += volume[cell].sum() ** (1.0 / dim) / (cell_start[s + 1] - cell_start[s])
+def _is_unstable(pos, vel, forcing, layer, last, at_end, length, number, first_node, end_node):
+    """Tell whether the substeps of the scene of these nodes were too long, see ``elastic_motion._unstable``."""
     before = pushed = after = thickest = 0.0
-    for n in range(node_start[s], node_start[s + 1]):
+    for n in range(first_node, end_node):
         v = f = w = x = 0.0
-        for a in range(dim):
+        for a in range(pos.shape[1]):
             v, f, w, x = v + vel[n, a] ** 2, f + forcing[n, a] ** 2, w + at_end[n, a] ** 2, x + (last[n, a] - pos[n, a]) ** 2
         if not math.isfinite(w) or not math.isfinite(x):
             return True

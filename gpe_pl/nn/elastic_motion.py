@@ -207,6 +207,8 @@ def elastic_motion(
 ) -> ElasticMotion:
     """Return the motion over a frame.
 
+    A scene whose substeps prove too long is computed again with ``MAX_SUBSTEPS``, and then with the softer laws of ``SOFTER``. Other scenes do not change.
+
     Args:
         pos: positions at the start [m].
         vel: velocities at the start [m/frame].
