@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import gpe_pl.nn.elastic_motion as elastic_motion_module
+from gpe_pl.nn.elastic_bodies_kernels import _is_unstable
 from gpe_pl.nn.elastic_motion import MAX_SUBSTEPS, SOFTER, Cells, Walls, elastic_motion
 from gpe_pl.nn.elastic_touch import Touching
 from gpe_pl.nn.fused import unfused
@@ -381,6 +382,25 @@ def test_any_constants_keep_a_body_finite(kind: str) -> None:
             pos, vel = body.moved(pos, vel)
         assert torch.isfinite(pos).all() and torch.isfinite(vel).all()
         assert float(pos.std()) < 3 * before
+
+
+@pytest.mark.parametrize("part", ["start", "forcing", "cell", "layer"])
+@pytest.mark.parametrize("result", ["displacement", "velocity"])
+def test_both_versions_take_the_same_speed_for_unstable(part: str, result: str) -> None:
+    """One part of the bound is large. A result just below the bound is stable, one just above it is not, and neither is one that is not finite."""
+    body, number = Body("triangles"), torch.tensor([7])
+    zero = torch.zeros_like(body.rest)
+    vel, forcing, layer, moved, last = zero.clone(), zero.clone(), torch.zeros(len(zero), 3).double(), zero.clone(), zero.clone()
+    vel[1] = torch.tensor([3.0, 4.0]) if part == "start" else 0.0
+    forcing[2] = torch.tensor([3.0, 4.0]) if part == "forcing" else 0.0
+    layer[3, 0] = 5.0 if part == "layer" else 0.0
+    length = float(body.cells.volume.sum(dim=1).sqrt().mean())
+    bound = 7 * length + {"start": 5.0, "forcing": 5.0, "cell": 0.0, "layer": 7 * 5.0}[part]
+    for speed, expected in ((0.999 * bound, False), (1.001 * bound, True), (math.inf, True), (math.nan, True)):
+        (moved if result == "displacement" else last)[4, 1] = speed
+        assert elastic_motion_module._unstable(vel, forcing, layer, moved, last, body.cells, number).tolist() == [expected]
+        arrays = [t.numpy() for t in (body.rest, vel, forcing, layer, body.rest + moved, last)]
+        assert _is_unstable(*arrays, float(body.cells.length), int(number), 0, len(zero)) == expected
 
 
 CRUSHING = [("triangles", 5.0), ("quadrilaterals", 8.0), ("tetrahedra", 3.0), ("hexahedra", 4.0)]
