@@ -31,6 +31,7 @@ from gpe_pl.graphs.topology import GraphError, Topology
 from gpe_pl.learned import next_states, rollout_settings, training_ranges, transfer
 from gpe_pl.learned.checkpoint_file import CheckpointError as CheckpointError
 from gpe_pl.learned.checkpoint_file import load_checkpoint, reason
+from gpe_pl.learned.checkpoint_weights import check_sizes, check_statistics
 from gpe_pl.learned.least_distance import kept_apart
 from gpe_pl.learned.mirror_average import MirrorAverage
 from gpe_pl.learned.next_states import Rows
@@ -490,42 +491,6 @@ class LearnedSimulator(nn.Module):
         """Return the next state under an acceleration [node, dim] in m/s² that includes gravity, without static friction. Rigid bodies keep their shape."""
         return next_states.advanced(state, acc, self.builder.metadata.frame_dt)
 
-    @classmethod
-    def _check_size(cls, description: dict[str, Any], weights: dict[str, Tensor]) -> None:
-        """Raise ``ValueError`` if weights do not have the names, shapes and types that follow from a description. No memory is allocated for the model."""
-        try:
-            with torch.device("meta"):
-                expected = cls.from_description(description).state_dict()
-        except RuntimeError:  # the constructor of a model reads its values; other errors will be raised again
-            return
-        for name, value in weights.items():
-            if name in expected and value.shape != expected[name].shape:
-                raise ValueError(f"size mismatch for {name}: {tuple(value.shape)} instead of {tuple(expected[name].shape)}")
-            if name in expected and value.is_floating_point() != expected[name].is_floating_point():
-                raise ValueError(f"{name} is of type {value.dtype}")
-            if value.untyped_storage().nbytes() < value.numel() * value.element_size():
-                raise ValueError(f"{name} has fewer values than its shape says")
-        missing = expected.keys() - weights.keys() - {"trained_mass"}
-        if missing:
-            raise ValueError(f"Missing key {min(missing)}")
-
-    def _check_values(self) -> None:
-        for name, values in self.state_dict().items():
-            is_range = name.startswith("trained_")  # unlimited before training
-            if bool(values.isnan().any()) or not (is_range or bool(values.isfinite().all())):
-                raise ValueError(f"{name} has values that are not finite")
-            is_scale = name in ("acceleration_std", "stress_std") or (name.startswith("standardizer.") and name.endswith(("std", "mass")))
-            if is_scale and not bool((values > 0).all()):
-                raise ValueError(f"{name} has values that are not positive")
-        for material, trained in self.trained_ranges():
-            if not bool((trained[0] <= trained[1]).all()):
-                raise ValueError(f"the lowest value of trained_{material} is above the highest")
-        low, high = self.trained_scene
-        if not bool(((low <= high) | (low.isposinf() & high.isneginf())).all()):
-            raise ValueError("the lowest value of trained_scene is above the highest")
-        if not bool((self.trained_mass[0] <= self.trained_mass[1]).all()):
-            raise ValueError("the lowest value of trained_mass is above the highest")
-
     # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
 
     def description(self) -> dict[str, Any]:
@@ -562,6 +527,16 @@ class LearnedSimulator(nn.Module):
         simulator = cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder, stride)
         return simulator.configured(**rollout_settings.stored(values))
 
+    @classmethod
+    def _check_sizes(cls, weights: dict[str, Tensor], description: dict[str, Any]) -> None:
+        """Check that weights fit a description, before memory is allocated for the model."""
+        try:
+            with torch.device("meta"):
+                expected = cls.from_description(description).state_dict()
+        except RuntimeError:  # the constructor of a model reads its values; other errors will be raised again
+            return
+        check_sizes(weights, expected, optional="trained_mass")
+
     def save(self, path: Path | str) -> None:
         """Write weights and description, atomically, for ``from_checkpoint``. A training checkpoint also has the optimiser's state."""
         weights = {f"simulator.{name}": value.detach().cpu().clone() for name, value in self.state_dict().items()}
@@ -588,10 +563,10 @@ class LearnedSimulator(nn.Module):
             if not isinstance(checkpoint, dict):
                 raise TypeError(f"holds a {type(checkpoint).__name__}")
             weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
-            cls._check_size(checkpoint["simulator"], weights)
+            cls._check_sizes(weights, checkpoint["simulator"])
             simulator = cls.from_description(checkpoint["simulator"])
             simulator.load_state_dict(weights)
-            simulator._check_values()
+            check_statistics(simulator.state_dict())
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(
                 f"{path}: not a checkpoint of gpe_pl or one of another model ({reason(error)}); take last.ckpt, or train again with this version"

@@ -14,7 +14,6 @@ from functools import partial
 from typing import Annotated, Any, Literal, cast
 
 import torch
-from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
@@ -25,17 +24,18 @@ from gpe_pl.models.gpe_program_runner import Decoded, GPEProgramRunner, notice
 from gpe_pl.nn.blocks import MLP, NORM_EPS
 from gpe_pl.nn.connected import Edges, merged_levels, order_of_edges, renumbered, reordered, touched
 from gpe_pl.nn.elastic_bodies import WALL_DAMPING, CellError, ElasticBodies
+from gpe_pl.nn.encoders import MaterialEmbedding, MaterialEmbeddingKind, OddEncoder
 from gpe_pl.nn.fused import works_on
 from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_processor
 from gpe_pl.nn.island_momentum import IslandMomentum, conserve, grouped, joined, moved_by_contacts
 from gpe_pl.nn.momentum_conv import RAW, EdgeState, Implementation, Interaction, MomentumConv, orient
 from gpe_pl.nn.node_loads import loads_of, plus, without_held_bodies
+from gpe_pl.nn.pair_force import PairForce
 from gpe_pl.nn.strain_scale import StrainScale
 from gpe_pl.schema import BOUNDARY, CELL, MESH_MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
 Decoder = Literal["node", "pair", "contact"]
 LevelWeights = Literal["shared", "separate"]
-MaterialEmbeddingKind = Literal["affine", "mlp", "none"]
 NodeNorm = Literal["none", "layer"]
 StressUnit = Literal["data", "strain"]
 
@@ -46,92 +46,6 @@ class StressError(GpeError, ValueError):
 
 class IslandError(GpeError, ValueError):
     """Raised when islands or bodies should move as a whole but the graphs do not contain them, or when momentum would not be conserved."""
-
-
-class MaterialEmbedding(nn.Module):
-    """Embedding Θ(v) of material parameters (paper, section 2.1).
-
-    ``affine`` satisfies Θ(λv₁ + (1−λ)v₂) = λΘ(v₁) + (1−λ)Θ(v₂). ``mlp`` does not and serves for comparison. Here v are the values that graphs have:
-    logarithms of some parameters, or physical values with ``graph.parameter_scale=linear``.
-    """
-
-    def __init__(self, param_channels: int, hidden_channels: int, kind: MaterialEmbeddingKind, is_fused: bool) -> None:
-        super().__init__()
-        if kind == "affine":
-            self.theta: nn.Module = nn.Linear(param_channels, hidden_channels)
-        else:
-            self.theta = MLP(param_channels, hidden_channels, hidden_channels, is_fused=is_fused)
-
-    def forward(self, params: Float[Tensor, "node param"]) -> Float[Tensor, "node hidden"]:
-        return self.theta(params)
-
-
-class OddEncoder(nn.Module):
-    """Encoder of the odd edge state.
-
-    It computes C (φ(W o + S s + b) − φ(−W o + S s + b)) from odd features o and even features s. C has no bias, so the result is odd.
-    """
-
-    def __init__(self, odd_channels: int, even_channels: int, hidden_channels: int) -> None:
-        super().__init__()
-        self.lin_odd = nn.Linear(odd_channels, hidden_channels, bias=False)
-        self.lin_even = nn.Linear(even_channels, hidden_channels)
-        self.act = nn.PReLU()
-        self.lin_out = nn.Linear(hidden_channels, hidden_channels, bias=False)
-
-    def hidden(self, odd: Tensor, even: Tensor) -> Tensor:
-        w, s = self.lin_odd(odd), self.lin_even(even)
-        return self.act(s + w) - self.act(s - w)
-
-    def forward(self, odd: Float[Tensor, "edge odd"], even: Float[Tensor, "edge even"]) -> Float[Tensor, "edge hidden"]:
-        return self.lin_out(self.hidden(odd, even))
-
-
-class PairForce(nn.Module):
-    """Decoder of one force per edge from the final node states.
-
-    With z_ij = A h_i + B h_j + W o_ij + S s_ij + b, the force on the target i is
-
-    F_ij = C (φ(z_ij) − φ(z_ji)) within a type, and F_ij = C φ(z_ij) + c between two types.
-
-    The force on the source is −F_ij, so the sum of all forces is zero up to rounding.
-    """
-
-    def __init__(self, spec: FeatureSpec, relation: EdgeType, hidden_channels: int) -> None:
-        super().__init__()
-        self.bipartite = relation[0] != relation[2]
-        self.lin_target = nn.Linear(hidden_channels, hidden_channels, bias=False)
-        self.lin_source = nn.Linear(hidden_channels, hidden_channels, bias=False)
-        self.lin_odd = nn.Linear(spec.odd_channels[relation], hidden_channels, bias=False)
-        self.lin_even = nn.Linear(spec.even_channels[relation], hidden_channels)
-        self.act = nn.PReLU()
-        self.lin_out = nn.Linear(hidden_channels, spec.dim, bias=self.bipartite)
-
-    def forward(
-        self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, odd: Tensor, even: Tensor, chunk: int | None = None
-    ) -> Float[Tensor, "edge dim"]:
-        """Return the force on the target of every edge; the opposite force acts on the source.
-
-        Args:
-            h_source, h_target: final states of the nodes at both ends [node, hidden]; one tensor within a type.
-            edge_index: source (row 0) and target (row 1) of each edge.
-            odd, even: features of the edges [edge, channel].
-            chunk: number of edges for which forces are computed at a time; None takes all at once.
-        """
-        a, b = self.lin_target(h_target), self.lin_source(h_source)
-        if chunk is None:
-            return self._force(a, b, edge_index, odd, even)
-        parts = zip(edge_index.split(chunk, dim=1), odd.split(chunk), even.split(chunk), strict=True)
-        return torch.cat([self._force(a, b, *part) for part in parts])
-
-    def _force(self, a: Tensor, b: Tensor, edge_index: Tensor, odd: Tensor, even: Tensor) -> Tensor:
-        j, i = edge_index
-        s, w = self.lin_even(even), self.lin_odd(odd)
-        forward = self.act(a[i] + b[j] + s + w)
-        if self.bipartite:
-            return self.lin_out(forward)
-        reverse = self.act(a[j] + b[i] + s - w)  # both ends have one type, so they index the same rows
-        return self.lin_out(forward - reverse)
 
 
 def _conv(conv: Any) -> Conv:

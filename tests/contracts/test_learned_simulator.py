@@ -410,6 +410,11 @@ def test_a_description_of_another_model_is_refused(simulator: LearnedSimulator, 
         ("trained_sand", lambda x: torch.tensor([[40.0], [20.0]]), "the lowest value of trained_sand is above the highest"),
         ("trained_sand", lambda x: torch.tensor([[20], [40]]), "trained_sand is of type torch.int64"),
         (
+            "trained_mass",
+            lambda x: torch.tensor([[2.0], [1.0]]).to(x).expand_as(x).clone(),
+            "the lowest value of trained_mass is above the highest",
+        ),
+        (
             "standardizer.node.sand.std",
             lambda x: x[:1].clone().expand_as(x),
             "has fewer values than its shape says",

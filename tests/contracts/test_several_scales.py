@@ -22,7 +22,7 @@ from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.topology import GraphError
-from gpe_pl.learned.simulator import LearnedSimulator, SceneError
+from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator, SceneError
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.blocks import Standardize
 from gpe_pl.system.compiled import unfused
@@ -155,6 +155,15 @@ def test_a_copy_at_another_scale_is_saved_as_the_model_itself(tmp_path: Path) ->
     assert loaded.builder.metadata == simulator.builder.metadata
     assert dict(loaded.described_training())["spacing"] == "0.05 to 0.1 m"
     assert torch.equal(loaded.at(0.08, 0.01).step(s).pos, simulator.at(0.08, 0.01).step(s).pos)
+
+
+@pytest.mark.parametrize("column", [0, 1])
+def test_a_checkpoint_with_a_reversed_range_of_scales_is_refused(tmp_path: Path, column: int) -> None:
+    simulator = learned(built())
+    simulator.trained_scales[:, column] = simulator.trained_scales[:, column] * torch.tensor([2.0, 1.0])
+    simulator.save(tmp_path / "model.ckpt")
+    with pytest.raises(CheckpointError, match="the lowest value of trained_scales is above the highest"):
+        LearnedSimulator.from_checkpoint(tmp_path / "model.ckpt")
 
 
 def test_meshes_are_refused() -> None:
