@@ -23,8 +23,10 @@ from torch_geometric.nn.aggr import SumAggregation
 
 from gpe_pl.models.gpe_program import GPEProgram
 from gpe_pl.nn.blocks import MLP
+from gpe_pl.nn.encoders import MaterialEmbedding, OddEncoder
 from gpe_pl.nn.momentum_conv import MomentumConv
 from gpe_pl.nn.network_program import Executable, Tables
+from gpe_pl.nn.pair_force import PairForce
 from gpe_pl.nn.pointers import checksum
 from gpe_pl.nn.stores import contents
 from gpe_pl.rollout.skips import Skips
@@ -35,8 +37,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-COVERED = (nn.Linear, nn.PReLU, nn.LayerNorm, nn.ModuleDict, nn.ModuleList, MLP, MomentumConv, SumAggregation)
-"""Classes of layers that a program covers, beside those in ``models.gpe``. A program knows their equations, so subclasses are not covered."""
+COVERED = (
+    *(nn.ModuleDict, nn.ModuleList, nn.Linear, nn.PReLU, nn.LayerNorm),
+    *(MLP, MaterialEmbedding, OddEncoder, MomentumConv, PairForce, SumAggregation),
+)
+"""Classes of layers that a program covers. A program knows their equations, so subclasses are not covered."""
 
 
 class Decoded(NamedTuple):
@@ -73,9 +78,7 @@ class GPEProgramRunner:
         ]  # the law and the strain are no parts of the program
         self._hooks = [hooks for m in modules[1:] for hooks in (m._forward_hooks, m._forward_pre_hooks)]
         self._attributes = [vars(m) for m in layers]
-        self._unknown = next(
-            (type(m).__name__ for m in layers if type(m) not in COVERED and type(m).__module__ != type(model).__module__), None
-        )
+        self._unknown = next((type(m).__name__ for m in layers if type(m) not in COVERED), None)
         parts = [
             (own, name, part) for m in modules for own in (m._modules, m._parameters) for name, part in own.items() if part is not None
         ]
