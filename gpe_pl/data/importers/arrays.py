@@ -131,6 +131,7 @@ def _load(path: Path, stated: Facts, facts: Facts) -> Loaded:
         if "cells" in values:
             raise Refusal(f"has cells and cells_{next(iter(by_kind))}; give all of them by kind")
         values["cells"] = by_kind
+    own_bounds = None if stated.bounds is not None else values.get("bounds")  # later, all files have the bounds that enclose theirs
     given = {"frame_dt", "bounds", "periodic", "gravity", "spacing", "connectivity_radius"}
     values |= {name: value for name in given if (value := getattr(facts, name)) is not None}
     values["params"] = merged({m: v for m, v in facts.parameters.items() if m in np.unique(values["materials"])}, own)
@@ -152,7 +153,8 @@ def _load(path: Path, stated: Facts, facts: Facts) -> Loaded:
         values["boundary"] = make(wall.pop("pos"), wall.pop("normal"), **wall)
     if facts.walls:
         dim = numbers("pos", values["pos"], {"frame": None, "node": None, "dim": None}).shape[2]
-        bounds = tuple((float(low), float(high)) for low, high in values["bounds"]) if "bounds" in values else None
+        rows = values.get("bounds") if own_bounds is None else own_bounds
+        bounds = None if rows is None else tuple((float(low), float(high)) for low, high in rows)
         here = replace(facts, bounds=bounds, periodic=space.periodic or None)
         values["boundary"] = joined(dim, values.get("boundary", Boundary.empty(dim)), walls_at_bounds(here, dim))
     return Loaded(Trajectory.from_numpy(**values), notes=tuple(notes))

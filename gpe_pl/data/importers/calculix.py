@@ -14,7 +14,7 @@ What becomes of the deck and the results:
 - ``*CLOAD`` with its amplitude becomes forces on nodes. The force of a frame is the mean of the forces at its two ends.
 - ``*DLOAD`` and ``*DSLOAD`` of pressures on faces become forces on nodes, too. With ``NLGEOM``, pressures follow the deformation: forces are those on the faces
   as they are in the results. Without it, they are those on undeformed faces.
-- ``*DLOAD`` with ``GRAV`` becomes gravity.
+- ``*DLOAD`` with ``GRAV`` becomes gravity, which must be the same for all elements at all times.
 
 Units are those of the deck, which have to be SI units. The first frame is the time before the first result, in which everything is at rest and free of stress.
 """
@@ -121,6 +121,8 @@ def _frames(results: frd.Results, name: str, count: int) -> np.ndarray | None:
         return None
     if len(found) != count:
         raise Refusal(f"has {name} in {len(found)} of {count} frames; write all results with the same FREQUENCY")
+    if name in results.partial:
+        raise Refusal(f"has no {name} at node {results.partial[name]}; write results of all nodes, without NSET")
     return np.stack(found)
 
 
@@ -146,6 +148,8 @@ def _nodes(results: frd.Results, conditions: deck.Deck) -> tuple[np.ndarray, np.
                 add_to_nodes(constants[k], cells[own], share * value)
     if (mass == 0).any():
         raise Refusal(f"node {results.node_ids[int((mass == 0).argmax())]} belongs to no cell; leave it out of the deck")
+    if conditions.damped:
+        notes.append("materials have *DAMPING, which is not stored; models have to learn it (model.viscous=true with law=elastic)")
     if not is_elastic:
         notes.append("materials without *ELASTIC have no Young's modulus (parameters={solid: …})")
     return number, mass, [*(constants / mass)] if is_elastic else None, notes

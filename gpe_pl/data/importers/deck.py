@@ -5,7 +5,7 @@ Only what a trajectory needs is read. Meshes and results come from the result fi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +18,8 @@ Amplitude = tuple[np.ndarray, np.ndarray]
 """Times [s] and factors of a load."""
 Face = tuple[int, ...]
 """Numbers of the nodes of a face."""
+Pull = tuple[set[int], np.ndarray]
+"""Numbers of elements, and an acceleration [3] that gravity gives them."""
 Card = tuple[str, dict[str, str], list[list[str]]]
 """Keyword, parameters in upper case, and data lines of a card."""
 
@@ -31,6 +33,19 @@ UNSEEN = {
     **dict.fromkeys(("INITIALCONDITIONS", "TEMPERATURE"), "moves or strains bodies without a force"),
 }
 """Cards that change the motion by what a trajectory cannot hold, and how."""
+READ_OF_LOADS, READ_OF_AMPLITUDES = {"AMPLITUDE", "OP"}, {"NAME", "TIME"}
+"""Parameters of *CLOAD, *DLOAD and *DSLOAD, and of *AMPLITUDE, that are read or change nothing. Others change when or where loads act."""
+PROCEDURES = (
+    "STATIC",
+    "FREQUENCY",
+    "BUCKLE",
+    "MODALDYNAMIC",
+    "STEADYSTATEDYNAMICS",
+    "VISCO",
+    "HEATTRANSFER",
+    "COUPLEDTEMPERATURE-DISPLACEMENT",
+)
+"""Cards of computations that are no dynamics."""
 HOLDING = {"ENCASTRE": (1, 3), "PINNED": (1, 3), "XSYMM": (1, 1), "YSYMM": (2, 2), "ZSYMM": (3, 3)}
 """Named boundary conditions, as the first and last held axis."""
 
@@ -46,6 +61,7 @@ class Deck:
         pressures: amplitude, or None, and pressures by face, of each card.
         gravity: acceleration [3]; None if there is no gravity.
         follows: whether pressures follow the deformation (``NLGEOM``).
+        damped: whether a material has *DAMPING.
     """
 
     density: dict[str, float] = field(default_factory=dict)
@@ -55,6 +71,25 @@ class Deck:
     pressures: list[tuple[Amplitude | None, list[tuple[Face, float]]]] = field(default_factory=list)
     gravity: np.ndarray | None = None
     follows: bool = False
+    damped: bool = False
+
+    def add_forces(self, amplitude: Amplitude | None, loaded: Iterable[tuple[tuple[int, int], float]]) -> None:
+        """Add a card *CLOAD. Forces on a node along an axis add up, within a card and over cards.
+
+        Raises:
+            ValueError: an earlier card gives a force there another amplitude. CalculiX would apply the last one to both.
+        """
+        values: dict[tuple[int, int], float] = {}
+        for place, magnitude in loaded:
+            values[place] = values.get(place, 0.0) + magnitude
+        for other, earlier in self.forces:
+            both = values.keys() & earlier.keys()
+            if both and other is not amplitude:
+                node, axis = min(both)
+                raise ValueError(
+                    f"node {node} has forces with different amplitudes along axis {axis}, where CalculiX takes the last one for all of them"
+                )
+        self.forces.append((amplitude, values))
 
     def force(self, node_ids: np.ndarray, times: np.ndarray, rest_pos: np.ndarray, pos: np.ndarray) -> np.ndarray | None:
         """Return the forces on nodes at times [frame, node, 3] in N; None if there are none.
@@ -64,6 +99,9 @@ class Deck:
             times: times [frame] in s.
             rest_pos: undeformed positions [node, 3] in m.
             pos: positions at the times [frame, node, 3] in m. Pressures act on the faces there if they follow the deformation, otherwise on undeformed faces.
+
+        Raises:
+            Refusal: a node with a load is not in the results.
         """
         if not self.forces and not self.pressures:
             return None
@@ -72,8 +110,9 @@ class Deck:
         for amplitude, values in self.forces:
             factor = _factors(amplitude, times)
             for (node, axis), magnitude in values.items():
-                if node in row:
-                    total[:, row[node], axis - 1] += factor * magnitude
+                if node not in row:
+                    raise Refusal(f"node {node} has a force in the deck and is not in the results")
+                total[:, row[node], axis - 1] += factor * magnitude
         shape = pos if self.follows else np.broadcast_to(rest_pos, pos.shape)
         for amplitude, loaded in self.pressures:
             for count in (3, 4):
@@ -94,15 +133,15 @@ def read(path: Path) -> Deck:
     """Read a deck.
 
     Raises:
-        Refusal: the file is missing or no deck; it has several steps, includes other files, has distributed loads besides gravity and pressures, or has
-            cards of ``UNSEEN``.
+        Refusal: the file is missing or no deck; it has several steps, no *DYNAMIC or elements other than solids, includes other files, has distributed loads
+            besides gravity and pressures, has gravity that differs between elements or times, or has cards of ``UNSEEN``.
     """
     try:
         text = path.read_text(encoding="ascii", errors="replace")
     except FileNotFoundError:
         raise Refusal(f"{path.name} is missing beside the results") from None
     deck, sets, amplitudes, material = Deck(), dict[str, list[int]](), dict[str, Amplitude](), ""
-    elements, num_steps = _Elements(), 0
+    elements, num_steps, is_dynamic, pulls = _Elements(), 0, False, list[Pull]()
     for keyword, parameters, lines in _cards(text):
         try:
             if keyword in ("NODE", "NSET") and "NSET" in parameters:
@@ -110,7 +149,8 @@ def read(path: Path) -> Deck:
             elif keyword in ("ELEMENT", "ELSET", "SURFACE"):
                 elements.add(keyword, parameters, lines)
             elif keyword == "AMPLITUDE":
-                numbers = np.array([float(x) for line in lines for x in line])
+                _check_parameters(parameters, READ_OF_AMPLITUDES)
+                numbers = np.array([_number(x) for line in lines for x in line])
                 amplitudes[parameters["NAME"]] = numbers[0::2], numbers[1::2]
             elif keyword == "MATERIAL":
                 material = parameters["NAME"]
@@ -122,15 +162,18 @@ def read(path: Path) -> Deck:
                 for node, axes in _held(lines, sets):
                     deck.held.setdefault(node, set()).update(axes)
             elif keyword == "CLOAD":
-                deck.forces.append((_amplitude(parameters, amplitudes), dict(_loaded(lines, sets))))
+                _check_parameters(parameters, READ_OF_LOADS)
+                deck.add_forces(_amplitude(parameters, amplitudes), _loaded(lines, sets))
             elif keyword in ("DLOAD", "DSLOAD"):
+                _check_parameters(parameters, READ_OF_LOADS)
                 loaded = list[tuple[Face, float]]()
                 for place, label, *values in lines:
                     if label.upper() == "GRAV":
-                        strength, *way = (float(x) for x in values[:4])
-                        deck.gravity = strength * np.array(way)
+                        if "AMPLITUDE" in parameters:
+                            raise ValueError("gravity with an amplitude; a trajectory has one gravity at all times")
+                        pulls.append(({*_numbers(place, elements.sets, "elements")}, _gravity(values)))
                     else:
-                        loaded += [(face, float(values[0])) for face in elements.faces(keyword, place, label.upper())]
+                        loaded += [(face, _number(values[0])) for face in elements.faces(keyword, place, label.upper())]
                 if loaded:
                     deck.pressures.append((_amplitude(parameters, amplitudes), loaded))
             elif keyword in LOADS:
@@ -141,13 +184,27 @@ def read(path: Path) -> Deck:
                 raise Refusal(f"{path.name}: *TRANSFORM; give held axes and forces along the global axes")
             elif keyword == "INCLUDE":
                 raise Refusal(f"{path.name}: *INCLUDE; write the whole deck into one file")
+            elif (squeezed := keyword.replace(" ", "")) in PROCEDURES:
+                raise Refusal(f"{path.name}: *{keyword} is no dynamics; compute with *DYNAMIC, DIRECT")
+            elif keyword == "DYNAMIC":
+                is_dynamic = True
+            elif keyword == "DAMPING":
+                deck.damped = True
             elif keyword == "STEP":
+                if parameters.get("AMPLITUDE", "STEP") != "STEP":
+                    raise ValueError("AMPLITUDE=RAMP; give loads an *AMPLITUDE of their own")
                 num_steps += 1
                 deck.follows = "NLGEOM" in parameters and parameters["NLGEOM"] != "NO"
         except (ValueError, IndexError, KeyError) as error:
             raise Refusal(f"{path.name}: *{keyword} cannot be read ({error})") from None
     if num_steps != 1:
         raise Refusal(f"{path.name}: has {num_steps} steps, must have one *STEP with *DYNAMIC")
+    if not is_dynamic:
+        raise Refusal(f"{path.name}: has no *DYNAMIC, so its times are none; compute with *DYNAMIC, DIRECT")
+    try:
+        deck.gravity = _everywhere(pulls, elements)
+    except ValueError as error:
+        raise Refusal(f"{path.name}: {error}") from None
     return deck
 
 
@@ -166,7 +223,9 @@ def _cards(text: str) -> Iterator[Card]:
         elif card is not None and continues:
             card[1].update(_parameters(parts))
         elif card is not None:
-            card[2].append([part for part in parts if part])
+            while parts and not parts[-1]:
+                parts.pop()
+            card[2].append(parts)
         continues = line.endswith(",") and (line.startswith("*") or continues)
     if card is not None:
         yield card
@@ -201,6 +260,10 @@ class _Elements:
                 own.extend(face for place, label, *_ in lines for face in self._of_elements(place, label.upper().replace("S", "P", 1)))
         elif keyword == "ELSET":
             self.sets.setdefault(parameters["ELSET"], []).extend(_members(False, parameters, lines, self.sets, "elements"))
+        elif not parameters["TYPE"].startswith("C3D"):
+            raise ValueError(
+                f"TYPE={parameters['TYPE']} is no solid; CalculiX gives shells and beams other nodes. Mesh with C3D8, C3D6 or C3D4"
+            )
         elif (kind := kind_of(parameters["TYPE"])) is not None:
             width = 1 + CORNERS[kind]
             numbers = np.array([int(x) for line in lines for x in line]).reshape(-1, width)
@@ -244,7 +307,7 @@ def _members(is_table: bool, parameters: dict[str, str], lines: list[list[str]],
             first, last, *step = map(int, line)
             yield from range(first, last + 1, step[0] if step else 1)
         else:
-            for name in line:
+            for name in filter(None, line):
                 yield from _numbers(name, sets, what)
 
 
@@ -264,7 +327,7 @@ def _factors(amplitude: Amplitude | None, times: np.ndarray) -> np.ndarray:
 
 def _held(lines: list[list[str]], sets: dict[str, list[int]]) -> Iterator[tuple[int, range]]:
     for name, first, *rest in lines:
-        low, high = HOLDING[first.upper()] if not first.isdigit() else (int(first), int(rest[0]) if rest else int(first))
+        low, high = HOLDING[first.upper()] if not first.isdigit() else (int(first), int(rest[0]) if rest and rest[0] else int(first))
         for node in _numbers(name, sets, "nodes"):
             yield node, range(low, min(high, 3) + 1)
 
@@ -276,4 +339,41 @@ def _amplitude(parameters: dict[str, str], amplitudes: dict[str, Amplitude]) -> 
 def _loaded(lines: list[list[str]], sets: dict[str, list[int]]) -> Iterator[tuple[tuple[int, int], float]]:
     for name, axis, magnitude in lines:
         for node in _numbers(name, sets, "nodes"):
-            yield (node, int(axis)), float(magnitude)
+            yield (node, int(axis)), _number(magnitude)
+
+
+def _number(text: str) -> float:
+    """Return a number; an empty field is 0."""
+    return float(text or 0)
+
+
+def _check_parameters(parameters: dict[str, str], read: set[str]) -> None:
+    if others := sorted(parameters.keys() - read):
+        raise ValueError(f"{others[0]} is not read")
+
+
+def _gravity(values: list[str]) -> np.ndarray:
+    """Return the acceleration [3] of a line of *DLOAD with GRAV. CalculiX normalises the direction."""
+    strength, *way = (_number(x) for x in [*values, "", "", ""][:4])
+    length = np.linalg.norm(way)
+    if not length:
+        raise ValueError("gravity has no direction")
+    return strength * np.array(way) / length
+
+
+def _everywhere(pulls: list[Pull], elements: _Elements) -> np.ndarray | None:
+    """Return the sum of accelerations [3], which all elements must have; None if there are none.
+
+    Raises:
+        ValueError: elements have different accelerations.
+    """
+    if not pulls:
+        return None
+    if not elements.kind:  # the results have elements of their own
+        return np.asarray(sum(pull for _, pull in pulls))
+    each = np.array([sum((pull for own, pull in pulls if element in own), np.zeros(3)) for element in elements.kind])
+    differs = (each != each[0]).any(axis=1)
+    if differs.any():
+        one, other = ([*elements.kind][k] for k in (0, int(differs.argmax())))
+        raise ValueError(f"elements {one} and {other} have different gravity; a trajectory has one gravity for all")
+    return np.asarray(each[0])

@@ -34,6 +34,7 @@ class Results:
         material_names: names of the materials by their numbers.
         times: times of the results [frame].
         fields: results by name, such as ``DISP`` and ``STRESS``, each [frame, node, component].
+        partial: number of a node without values, by the names of results that do not have all nodes. Their values are 0 there.
     """
 
     node_ids: np.ndarray = field(default_factory=lambda: np.empty(0, int))
@@ -43,6 +44,7 @@ class Results:
     material_names: dict[int, str] = field(default_factory=dict)
     times: list[float] = field(default_factory=list)
     fields: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    partial: dict[str, int] = field(default_factory=dict)
 
 
 def read(path: Path) -> Results:
@@ -136,6 +138,10 @@ def _add_result(found: Results, time: float, lines: Iterator[str], width: int) -
     if not found.times or time > found.times[-1]:
         found.times.append(time)
     row = {int(node): k for k, node in enumerate(found.node_ids)}
-    result = np.zeros((len(found.node_ids), count))
-    result[[row[node] for node in _ids(values, width)]] = _table(values, 3 + width, count)
-    found.fields.setdefault(head.split()[1], []).append(result)
+    result, there = np.zeros((len(found.node_ids), count)), np.zeros(len(found.node_ids), bool)
+    rows = [row[node] for node in _ids(values, width)]
+    result[rows], there[rows] = _table(values, 3 + width, count), True
+    name = head.split()[1]
+    found.fields.setdefault(name, []).append(result)
+    if not there.all():
+        found.partial.setdefault(name, int(found.node_ids[there.argmin()]))

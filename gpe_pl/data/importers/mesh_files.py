@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,8 @@ EXODUS_KINDS = {
     "BEA": "line",
 }
 """Names in meshio of cells by the first three letters of their names in Exodus."""
+DECIMAL = re.compile(r"([0-9]+(?:[.][0-9]+)?(?:e[-+][0-9]+)?)", re.IGNORECASE)
+"""A number, which may have decimals and an exponent."""
 COMPONENTS = (("xx", "yy", "zz", "xy", "yz", "xz"), ("xx", "yy", "zz", "xy", "yz", "zx"), ("x", "y", "z"), ("x", "y"))
 """Endings of the names of the components of tensors, in VTK's order, and of vectors."""
 WEDGE = [0, 2, 1, 3, 5, 4]
@@ -104,13 +107,30 @@ def read_series(path: Path) -> list[Frame]:
         Refusal: a file is missing, damaged or of an unknown format, or has cells that are not linear.
     """
     if path.is_dir():
-        files = sorted((file for file in path.iterdir() if file.is_file()), key=lambda file: natural(file.name))
+        files = _in_order([file for file in path.iterdir() if file.is_file()])
         return [Frame.of(file.name, None, _mesh(file)) for file in files]
     if path.suffix.lower() == ".pvd":
         return [Frame.of(file.name, time, _mesh(file)) for time, file in _collection(path)]
     reader: Callable[[Path], Iterator[tuple[float, Any]]] = _xdmf if path.suffix.lower() in XDMF else _exodus
     with _readable(path):
         return [Frame.of(path.name, time, mesh) for time, mesh in reader(path)]
+
+
+def _in_order(files: list[Path]) -> list[Path]:
+    """Return files in the order of the numbers in their names.
+
+    Raises:
+        Refusal: the order depends on whether ``0.1`` is a number with decimals or two numbers.
+    """
+    ordered = sorted(files, key=lambda file: natural(file.name))
+    by_value = sorted(ordered, key=lambda file: [float(part) if k % 2 else part for k, part in enumerate(DECIMAL.split(file.stem))])
+    for whole, decimal in zip(ordered, by_value, strict=True):
+        if whole != decimal:
+            raise Refusal(
+                f"{whole.name} and {decimal.name}: the order of files is not clear, because their numbers have decimals; number them 0, 1, 2, …, or list them "
+                "with their times in a PVD file"
+            )
+    return ordered
 
 
 def times_of(path: Path) -> np.ndarray | None:
@@ -169,9 +189,25 @@ def _xdmf(path: Path) -> Iterator[tuple[float, Any]]:
 
     with meshio.xdmf.TimeSeriesReader(path) as reader:
         points, cells = reader.read_points_cells()
-        for k in range(reader.num_steps):
+        for k, grid in enumerate(reader.collection):
+            if any(
+                (own := _stored(grid, part)) is not None and own != _stored(reader.mesh_grid, part) for part in ("Geometry", "Topology")
+            ):
+                reader.mesh_grid = grid  # otherwise meshio takes one mesh for all times
+                moved, others = reader.read_points_cells()
+                points, cells = points if moved is None else moved, others or cells
+                reader.cells = cells
             time, point_data, cell_data = reader.read_data(k)
             yield time, meshio.Mesh(points, cells, point_data=point_data, cell_data=cell_data)
+
+
+def _stored(grid: ElementTree.Element, part: str) -> bytes | None:
+    """Return a part of a grid as it is stored in an XDMF file; None if the grid has none, or refers to that of another grid."""
+    element = grid.find(part)
+    items = [] if element is None else [element, *element.iter("DataItem")]
+    if element is None or len(items) < 2 or any("Reference" in item.attrib for item in items):
+        return None
+    return ElementTree.tostring(element).strip()
 
 
 def _exodus(path: Path) -> Iterator[tuple[float, Any]]:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gpe_pl.data.importers.source import Facts, Refusal
+from gpe_pl.schema import CELL_KINDS
 
 SIMPLICES = {
     "line": [[0, 1]],
@@ -36,8 +37,16 @@ def add_to_nodes(total: np.ndarray, cells: np.ndarray, values: np.ndarray) -> No
     np.add.at(total, cells.ravel(), np.repeat(values, cells.shape[1], axis=0))
 
 
+def of_highest_dimension(cells: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the cells of the highest dimension by kind. The sizes of others, such as triangles on the surface of tetrahedra, cannot be added to theirs."""
+    highest = max((CELL_KINDS[kind][0] for kind in cells), default=0)
+    return {kind: own for kind, own in cells.items() if CELL_KINDS[kind][0] == highest}
+
+
 def mean_at_nodes(rest_pos: np.ndarray, cells: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the mean [node, …] of the values of the cells around each node, weighted by the sizes of the cells; 0 at nodes without a cell.
+
+    At each node only the cells of the highest dimension there count.
 
     Args:
         rest_pos: positions at rest [node, dim] in m.
@@ -46,10 +55,15 @@ def mean_at_nodes(rest_pos: np.ndarray, cells: Mapping[str, np.ndarray], values:
     """
     shape = next(iter(values.values())).shape[1:]
     total, weight = np.zeros((len(rest_pos), *shape)), np.zeros(len(rest_pos))
-    for kind, own in cells.items():
-        size = sizes(rest_pos, kind, own)
-        add_to_nodes(total, own, values[kind] * size.reshape(-1, *[1] * len(shape)))
-        add_to_nodes(weight, own, size)
+    left = dict(cells)
+    while left:
+        highest, without = of_highest_dimension(left), weight == 0
+        for kind, own in highest.items():
+            size = sizes(rest_pos, kind, own)
+            here = without[own] * size[:, None]
+            np.add.at(total, own, here.reshape(*own.shape, *[1] * len(shape)) * values[kind][:, None])
+            np.add.at(weight, own, here)
+            del left[kind]
     return np.asarray(total / np.where(weight > 0, weight, 1.0).reshape(-1, *[1] * len(shape)))
 
 

@@ -15,7 +15,8 @@ Arrays are found by their names. ``arrays={displacement: U, stress: S}`` names t
 - ``stress`` of points or cells: 6 components in VTK's order XX, YY, ZZ, XY, YZ, XZ, or 9. The stress of a cell goes to its nodes, as the mean by size of cells.
 - ``prescribed`` of points: not 0 where the motion is given, or [point, axis] along which axes it is, as in the first frame.
 - ``force`` of points [point, axis] in N.
-- ``mass`` of points [kg], or ``density`` of points or cells [kg/m³]. Otherwise all masses are 1 kg, which does not suit forces.
+- ``mass`` of points [kg], or ``density`` of points or cells [kg/m³] (in 2D kg/m²), with which cells of the highest dimension count. Otherwise all masses are
+  1 kg, which does not suit forces.
 - ``material`` of points: numbers, which ``materials={1: elastomer}`` names. Without it, all have number 0, which is ``solid`` for meshes.
 - Parameters of materials at points or in cells, such as ``youngs_modulus`` and ``poisson_ratio``.
 
@@ -33,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.data.importers.mesh_files import ENDINGS, Frame, read_series, times_of
-from gpe_pl.data.importers.meshes import add_to_nodes, check_intervals, mean_at_nodes, sizes
+from gpe_pl.data.importers.meshes import add_to_nodes, check_intervals, mean_at_nodes, of_highest_dimension, sizes
 from gpe_pl.data.importers.source import (
     Facts,
     ImportFailure,
@@ -49,7 +50,7 @@ from gpe_pl.data.importers.source import (
     typed,
 )
 from gpe_pl.errors.printable import did_you_mean
-from gpe_pl.schema import BOUNDARY, MATERIALS
+from gpe_pl.schema import BOUNDARY, CELL_KINDS, MATERIALS
 
 PARAMETERS = tuple(dict.fromkeys(p.name for own in MATERIALS.values() for p in own))
 ROLES = ("displacement", "velocity", "stress", "prescribed", "force", "mass", "density", "material", *PARAMETERS)
@@ -189,12 +190,18 @@ def _add_masses(nodes: Nodes, arrays: _Arrays, rest: np.ndarray, cells: Mapping[
     if mass is not None:
         nodes.mass = mass[0].reshape(-1)
     elif density is not None and cells:
-        own, total = density[0].reshape(-1), np.zeros(len(rest))
-        for kind, rows in cells.items():
+        own, total, filling = density[0].reshape(-1), np.zeros(len(rest)), of_highest_dimension(cells)
+        kind = next(iter(filling))
+        if (has := CELL_KINDS[kind][0]) != rest.shape[1]:
+            raise Refusal(
+                f"has a density, from which masses follow, and its cells of kind {kind} have {has} dimensions in {rest.shape[1]}D, so their thickness is not "
+                f"known; give masses of points as {arrays.name('mass')!r}"
+            )
+        for kind, rows in filling.items():
             add_to_nodes(total, rows, own[rows].mean(axis=1) * sizes(rest, kind, rows) / rows.shape[1])
         if (total == 0).any():
             raise Refusal(
-                f"point {int((total == 0).argmax())} belongs to no cell, so it has no mass; leave it out or give {arrays.name('mass')!r}"
+                f"point {int((total == 0).argmax())} belongs to no cell of {has} dimensions, so it has no mass; leave it out or give {arrays.name('mass')!r}"
             )
         nodes.mass = total
     else:

@@ -102,6 +102,14 @@ def results(moved: np.ndarray, times: np.ndarray, code: int = 1) -> str:
     return "\n".join([*lines, " 9999"]) + "\n"
 
 
+def without_a_node(results: str) -> str:
+    """Remove node 109 from the displacements of one frame, as with NSET."""
+    blocks = results.split("  100CL")
+    blocks[5] = "\n".join(line for line in blocks[5].split("\n") if not line.startswith(f" -1{109:10d}"))
+    assert "DISP" in blocks[5]
+    return "  100CL".join(blocks)
+
+
 def write(folder: Path, edit: Callable[[str], str] = str, edit_results: Callable[[str], str] = str, step: float = DT) -> None:
     nodes = "\n".join(f"{node}, {x:.6g}, {y:.6g}, {z:.6g}" for node, (x, y, z) in zip(IDS, POINTS, strict=True))
     folder.mkdir(parents=True, exist_ok=True)
@@ -157,6 +165,51 @@ def test_nodes_can_be_held_along_some_axes(tmp_path: Path) -> None:
     assert own.metadata.loads == ("motion", "sliding", "force")
 
 
+ELEMENTS = "\n".join(f"{k}, {', '.join(str(IDS[node]) for node in cell)}" for k, cell in enumerate(CELLS, start=1))
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        "BODY, GRAV, 9.81, 0., 0., -10.",
+        "BODY, GRAV, 9.81, , , -1.,",
+        "1, GRAV, 9.81, 0., 0., -1.\n2, GRAV, 9.81, 0., 0., -1.",
+        "BODY, GRAV, 5.81, 0., 0., -1.\nBODY, GRAV, 4., 0., 0., -1.",
+    ],
+)
+def test_gravity_adds_up_and_its_direction_is_normalised(tmp_path: Path, lines: str) -> None:
+    """As in CalculiX, which leaves empty fields 0."""
+    write(
+        tmp_path / "raw",
+        lambda d: d.replace("ELSET=BODY\n", f"ELSET=BODY\n{ELEMENTS}\n", 1).replace("BODY, GRAV, 9.81, 0., 0., -1.", lines),
+    )
+    for own in imported(tmp_path):
+        assert own.metadata.gravity == pytest.approx((0.0, 0.0, -9.81))
+
+
+def test_forces_on_a_node_add_up_within_a_card(tmp_path: Path) -> None:
+    write(tmp_path / "raw", lambda d: d.replace("117, 1, 0.5", "117, 1, 0.5\nTIP, 1, 0.25\n119, 3, "))
+    with pytest.raises(ImportFailure, match="not enough values"):
+        imported(tmp_path)
+    write(tmp_path / "raw", lambda d: d.replace("117, 1, 0.5", "117, 1, 0.5\nTIP, 1, 0.25"))
+    for own in imported(tmp_path):
+        assert own.force is not None
+        np.testing.assert_allclose(own.force[:, 8:, 0], np.tile([0.75, 0.25, 0.25, 0.25], (FRAMES + 1, 1)), rtol=1e-6)
+
+
+def test_an_empty_last_axis_of_a_boundary_is_the_first_one(tmp_path: Path) -> None:
+    write(tmp_path / "raw", lambda d: d.replace("Clamped, 1, 3\n", "Clamped, 2, , 0.\n"))
+    for own in imported(tmp_path):
+        assert own.prescribed is not None
+        assert own.prescribed.tolist() == [[False, True, False]] * 4 + [[False] * 3] * 8
+
+
+def test_damping_is_noted(tmp_path: Path) -> None:
+    write(tmp_path / "raw", lambda d: d.replace("*DENSITY", "*DAMPING, ALPHA=0., BETA=1e-3\n*DENSITY"))
+    report = import_dataset(tmp_path / "data", ImportSettings("calculix", str(tmp_path / "raw"), "set"))
+    assert any("*DAMPING, which is not stored" in note for note in report.notes)
+
+
 @pytest.mark.parametrize(
     ("edit", "edit_results", "message"),
     [
@@ -186,6 +239,34 @@ def test_nodes_can_be_held_along_some_axes(tmp_path: Path) -> None:
         ),
         (lambda d: d.replace("*STEP", "*TRANSFORM, NSET=TIP\n1., 0., 0., 0., 1., 0.\n*STEP"), str, r"\*TRANSFORM; give held axes"),
         (lambda d: d + "*STEP\n*END STEP\n", str, "has 2 steps, must have one"),
+        (
+            lambda d: d.replace("TYPE=C3D8,", "TYPE=S4,"),
+            str,
+            r"\*ELEMENT cannot be read \(TYPE=S4 is no solid; CalculiX gives shells and beams other nodes",
+        ),
+        (lambda d: d.replace("*DYNAMIC, DIRECT", "*STATIC, DIRECT"), str, r"\*STATIC is no dynamics; compute with \*DYNAMIC"),
+        (lambda d: d.replace("*DYNAMIC, DIRECT\n0.01, 0.06\n", ""), str, r"has no \*DYNAMIC"),
+        (
+            lambda d: d.replace("*STEP, NLGEOM", "*STEP, AMPLITUDE=RAMP, NLGEOM"),
+            str,
+            r"AMPLITUDE=RAMP; give loads an \*AMPLITUDE of their own",
+        ),
+        (lambda d: d.replace("*CLOAD\n", "*CLOAD, TIME DELAY=0.03\n"), str, r"\*CLOAD cannot be read \(TIME DELAY is not read\)"),
+        (lambda d: d.replace("NAME=RISE", "NAME=RISE, SHIFTX=0.1"), str, r"\*AMPLITUDE cannot be read \(SHIFTX is not read\)"),
+        (lambda d: d.replace("117, 1, 0.5", "117, 1, 0.5\n999, 1, 0.5"), str, "node 999 has a force in the deck and is not in the results"),
+        (lambda d: d.replace("117, 1, 0.5", "117, 2, 0.5"), str, "node 117 has forces with different amplitudes along axis 2"),
+        (lambda d: d.replace("*DLOAD", "*DLOAD, AMPLITUDE=RISE"), str, "gravity with an amplitude"),
+        (lambda d: d.replace("9.81, 0., 0., -1.", "9.81, 0., 0., 0."), str, "gravity has no direction"),
+        (
+            lambda d: d.replace("ELSET=BODY\n", f"ELSET=BODY\n{ELEMENTS}\n", 1).replace("BODY, GRAV", "2, GRAV"),
+            str,
+            "elements 1 and 2 have different gravity; a trajectory has one",
+        ),
+        (
+            str,
+            without_a_node,
+            "has no DISP at node 109; write results of all nodes, without NSET",
+        ),
         (lambda d: d.replace("TIP, 2, -4.", "TOP, 2, -4."), str, r"\*CLOAD cannot be read \(unknown set of nodes 'TOP'\)"),
         (str, lambda r: r.replace("    1    0    1", "    4    0    1"), "element 1 is quadratic or of an unknown type"),
         (str, lambda r: r.replace("DISP", "VELO"), "has no displacements"),
@@ -200,9 +281,6 @@ def test_what_cannot_be_read_is_refused_by_name(
     write(tmp_path / "raw", edit, edit_results)
     with pytest.raises(ImportFailure, match=message):
         imported(tmp_path)
-
-
-ELEMENTS = "\n".join(f"{k}, {', '.join(str(IDS[node]) for node in cell)}" for k, cell in enumerate(CELLS, start=1))
 
 
 @pytest.mark.parametrize(

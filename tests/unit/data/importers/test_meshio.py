@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset
+from gpe_pl.data.importers.meshes import mean_at_nodes
 from gpe_pl.export.trajectories import write_vtk
 from gpe_pl.trajectory.store import iter_trajectories
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -182,6 +183,86 @@ def test_exodus_with_all_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.pos - found.pos[0], displacement(POINTS), atol=1e-6)
     assert found.stress is not None and found.cells is not None and found.cells.tolist() == CELLS.tolist()
     np.testing.assert_allclose(found.stress.node[:, 0], stress(2)[:, 0][:, VTK], rtol=1e-5)
+
+
+def test_cells_of_the_surface_add_no_mass_and_no_stress(tmp_path: Path) -> None:
+    """Mesh generators write the triangles of the surface beside the tetrahedra."""
+    corners = SIZE * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    cells = [("triangle", np.array([[0, 1, 2], [0, 1, 3]])), ("tetra", np.array([[0, 1, 2, 3]])), ("line", np.array([[0, 1]]))]
+    (tmp_path / "raw" / "a").mkdir(parents=True)
+    for frame in range(FRAMES):
+        data = {
+            "density": [np.full(2, DENSITY), np.full(1, DENSITY), np.full(1, DENSITY)],
+            "stress": [np.full((2, 6), 7.0), np.full((1, 6), 3.0), np.full((1, 6), 9.0)],
+        }
+        mesh = meshio.Mesh(corners + displacement(corners)[frame], cells, cell_data=data)
+        mesh.write(tmp_path / "raw" / "a" / f"{frame}.vtu")
+    found = imported(tmp_path, frame_dt=DT)
+    np.testing.assert_allclose(found.mass, DENSITY * SIZE**3 / 6 / 4, rtol=1e-5)
+    assert found.stress is not None
+    np.testing.assert_allclose(found.stress.node, 3.0)
+
+
+def test_nodes_without_a_solid_have_the_mean_of_their_other_cells() -> None:
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [3.0, 0.0]])
+    cells = {"line": np.array([[1, 3], [0, 1]]), "triangle": np.array([[0, 1, 2]])}
+    found = mean_at_nodes(points, cells, {"line": np.array([5.0, 7.0]), "triangle": np.array([2.0])})
+    assert found.tolist() == [2.0, 2.0, 2.0, 5.0]
+
+
+def test_surfaces_in_space_have_no_mass_by_density(tmp_path: Path) -> None:
+    (tmp_path / "raw" / "a").mkdir(parents=True)
+    bent = FLAT + np.array([0.0, 0.0, 1.0]) * FLAT[:, :1]
+    for frame in range(FRAMES):
+        mesh = meshio.Mesh(bent + displacement(bent)[frame], [("triangle", TRIANGLES)], point_data={"density": np.full(len(FLAT), DENSITY)})
+        mesh.write(tmp_path / "raw" / "a" / f"{frame}.vtu")
+    with pytest.raises(
+        ImportFailure,
+        match="cells of kind triangle have 2 dimensions in 3D, so their thickness is not known; give masses of points as 'mass'",
+    ):
+        imported(tmp_path, frame_dt=DT)
+
+
+@pytest.mark.parametrize(("names", "is_clear"), [("0.05 0.10 0.15 0.20", True), ("0.05 0.1 0.15 0.2", False), ("1.8 1.9 1.10 1.11", False)])
+def test_files_are_in_the_order_of_their_numbers(tmp_path: Path, names: str, is_clear: bool) -> None:
+    (tmp_path / "raw" / "a").mkdir(parents=True)
+    for frame, name in enumerate(names.split()):
+        meshio.Mesh(FLAT + frame * SIZE, [("triangle", TRIANGLES)]).write(tmp_path / "raw" / "a" / f"out_{name}.vtu")
+    if is_clear:
+        found = imported(tmp_path, frame_dt=DT)
+        np.testing.assert_allclose(found.pos[:, 0, 0] - found.pos[0, 0, 0], SIZE * np.arange(4), atol=1e-6)
+    else:
+        with pytest.raises(
+            ImportFailure, match=r"the order of files is not clear, because their numbers have decimals; number them 0, 1, 2"
+        ):
+            imported(tmp_path, frame_dt=DT)
+
+
+@pytest.mark.parametrize("refers", [False, True])
+def test_grids_of_xdmf_have_their_own_points(tmp_path: Path, refers: bool) -> None:
+    """Or refer to those of the first grid."""
+    moved = FLAT + displacement(FLAT)
+    topology = f'<Topology TopologyType="Triangle" NumberOfElements="{len(TRIANGLES)}">{item(TRIANGLES)}</Topology>'
+    grids = ""
+    for frame in range(FRAMES):
+        mesh = f'{topology}<Geometry GeometryType="XYZ">{item(FLAT if refers else moved[frame])}</Geometry>'
+        if frame and refers:
+            mesh = '<Geometry Reference="XML">/Xdmf/Domain/Grid/Grid[1]/Geometry</Geometry>'
+        data = f'<Attribute Name="displacement" AttributeType="Vector" Center="Node">{item(moved[frame] - FLAT)}</Attribute>'
+        grids += f'<Grid Name="{frame}" GridType="Uniform">{mesh}<Time Value="{DT * frame}"/>{data}</Grid>'
+    (tmp_path / "raw").mkdir()
+    series = f'<Xdmf Version="3.0"><Domain><Grid GridType="Collection" CollectionType="Temporal">{grids}</Grid></Domain></Xdmf>'
+    (tmp_path / "raw" / "a.xdmf").write_text(series)
+    found = imported(tmp_path)
+    np.testing.assert_allclose(found.pos - found.pos[0], (moved - moved[0])[..., :2], atol=1e-6)
+    assert found.rest_pos is not None
+    np.testing.assert_allclose(found.rest_pos - found.rest_pos[0], (FLAT - FLAT[0])[:, :2], atol=1e-6)
+
+
+def item(values: np.ndarray) -> str:
+    kind = "Float" if values.dtype.kind == "f" else "Int"
+    text = "\n".join(" ".join(map(str, row)) for row in values.tolist())
+    return f'<DataItem DataType="{kind}" Dimensions="{values.shape[0]} {values.shape[1]}" Format="XML" Precision="8">{text}</DataItem>'
 
 
 def without(name: str, at: int = 0) -> Callable[[Any, int], Any]:

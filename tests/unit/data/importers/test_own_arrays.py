@@ -134,3 +134,16 @@ def test_own_arrays_with_as_little_as_possible(tmp_path: Path) -> None:
     assert (trajectory.boundary.normal[:, 1] > 0.5).all()
     assert trajectory.metadata.bounds == stored["test"][0].metadata.bounds
     assert any("else the extremes of positions" in note for note in report.notes)
+
+
+def test_walls_are_at_the_bounds_of_each_file(tmp_path: Path) -> None:
+    """The data set has bounds that enclose those of all files."""
+    (tmp_path / "raw").mkdir()
+    for k, width in enumerate((1.0, 1.0, 2.0)):
+        values: dict[str, Any] = {"bounds": [[0, width], [0, 1]], "spacing": SPACING}
+        np.savez(tmp_path / "raw" / f"{k}.npz", pos=motion(seed=k), frame_dt=DT, materials="sand", params_sand=30.0, **values)
+    _, stored = imported(tmp_path, tmp_path / "raw", "arrays", holdout=0.0, walls={"x_high": 0.5})
+    for trajectory, width in zip(stored["train"], (1.0, 1.0, 2.0), strict=True):
+        assert trajectory.metadata.bounds[0][1] - trajectory.metadata.bounds[0][0] == pytest.approx(2)
+        assert len(trajectory.boundary.pos) and np.ptp(trajectory.boundary.pos[:, 0]) == 0
+        assert trajectory.boundary.pos[0, 0] - trajectory.metadata.bounds[0][0] == pytest.approx(width, abs=1e-5)
