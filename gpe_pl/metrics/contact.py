@@ -20,8 +20,9 @@ middle of an edge is half a spacing away from both nodes of the edge."""
 def boundary_gaps(trajectory: Trajectory, bodies: list[Int64[np.ndarray, "_"]]) -> Float[np.ndarray, "frame body"]:
     """Return the smallest distance [m] of the nodes of each body to walls and obstacles.
 
-    It is the signed distance to the shapes of a boundary. If the boundary moves or has no shapes, it is the distance to the nearest boundary node. It is
-    infinite without a boundary.
+    It is the signed distance to the shapes of a boundary. If the boundary moves or has no shapes, it is the distance to the nearest boundary node. Nodes whose
+    motion is given do not count, and neither do nodes in one cell with them, because a clamp at a wall is no contact. The gap is infinite without a boundary,
+    and for a body without other nodes.
     """
     boundary, pos = trajectory.boundary, trajectory.pos.astype(np.float64)
     if boundary.shapes and boundary.motion is None:
@@ -31,7 +32,20 @@ def boundary_gaps(trajectory: Trajectory, bodies: list[Int64[np.ndarray, "_"]]) 
         distance = np.stack([boundary.at(frame).tree(periodicity).query(x)[0] for frame, x in enumerate(pos)])
     else:
         distance = np.full(pos.shape[:2], np.inf)
-    return np.stack([distance[:, nodes].min(axis=1) for nodes in bodies], axis=1)
+    free = ~_near_held_nodes(trajectory)
+    return np.stack([distance[:, nodes[free[nodes]]].min(axis=1, initial=np.inf) for nodes in bodies], axis=1)
+
+
+def _near_held_nodes(trajectory: Trajectory) -> Bool[np.ndarray, "node"]:
+    """Return a mask of the nodes whose motion is given along an axis, and of those in one cell with them."""
+    near = np.zeros(trajectory.num_nodes, bool)
+    if trajectory.prescribed is None:
+        return near
+    held = trajectory.prescribed.any(axis=1)
+    near |= held
+    if trajectory.cells is not None:
+        near[trajectory.cells[held[trajectory.cells].any(axis=1)]] = True
+    return near
 
 
 def contact_limits(gap: Float[np.ndarray, "frame body"], spacing: float) -> Float[np.ndarray, "body"]:

@@ -42,9 +42,9 @@ class Mirror:
 def mirrors(truth: Trajectory) -> list[Mirror]:
     """Return the vertical planes about which a scene is symmetric.
 
-    A scene is symmetric if its first frame equals its mirror image in positions, velocities, masses and materials, and if the walls and obstacles near
-    nodes of any frame do. Mesh cells are not compared, because the diagonals of a lattice of triangles are rarely symmetric. The list is empty in periodic
-    domains, and if the boundary moves or has nodes but no shapes.
+    A scene is symmetric if its first frame equals its mirror image in positions, velocities, masses and materials, if given motions and forces do in all
+    frames, and if the walls and obstacles near nodes of any frame do. Mesh cells are not compared, because the diagonals of a lattice of triangles are rarely
+    symmetric. The list is empty in periodic domains, and if the boundary moves or has nodes but no shapes.
     """
     metadata, boundary = truth.metadata, truth.boundary
     if any(metadata.periodic) or boundary.motion is not None or (len(boundary.pos) and not boundary.shapes):
@@ -63,9 +63,22 @@ def mirrors(truth: Trajectory) -> list[Mirror]:
         same = same and np.allclose(truth.mass, truth.mass[partner], rtol=1e-3)
         same = same and np.allclose(truth.material_params, truth.material_params[partner], rtol=1e-3, equal_nan=True)
         near = [np.minimum(signed_distance(boundary.shapes, x), metadata.connectivity_radius) for x in (pos, mirror.image(pos))]
-        if same and np.abs(near[0] - near[1]).max() <= close:
+        if same and np.abs(near[0] - near[1]).max() <= close and _has_mirrored_loads(truth, mirror, partner):
             found.append(Mirror(axis, mirror.offset, partner))
     return found
+
+
+def _has_mirrored_loads(truth: Trajectory, mirror: Mirror, partner: np.ndarray) -> bool:
+    """Tell whether given motions and forces equal their mirror images in all frames."""
+    held, force = truth.prescribed, truth.force
+    if held is not None:
+        way = (truth.pos.astype(np.float64) - mirror.image(truth.pos.astype(np.float64))[:, partner])[:, held]
+        if (held != held[partner]).any() or np.abs(way).max(initial=0.0) > CLOSE * truth.metadata.spacing:
+            return False
+    if force is None:
+        return True
+    opposite = force[:, partner] * np.where(np.arange(truth.metadata.dim) == mirror.axis, -1.0, 1.0)
+    return bool(np.abs(force - opposite).max(initial=0.0) <= CLOSE * np.abs(force).max(initial=0.0))
 
 
 def mirror_error(prediction: Trajectory, truth: Trajectory, mirror: Mirror, num_steps: int) -> float:

@@ -84,3 +84,21 @@ def test_gaps_follow_a_moving_boundary() -> None:
     path = nodes - 0.1 * np.arange(4)[:, None, None] * np.array([0.0, 1.0])
     piston = Boundary.moving(path, np.tile([0.0, 1.0], (4, 1)), 0.1)
     np.testing.assert_allclose(boundary_gaps(falling(boundary=piston), [np.arange(2)]), np.full((4, 1), 0.1), atol=1e-7)
+
+
+def test_a_clamp_at_a_wall_is_no_contact() -> None:
+    """Nodes of the clamp, and of the cells at the clamp, do not count; the free end does."""
+    rest = 0.1 * np.stack(np.meshgrid(np.arange(5), np.arange(2), indexing="ij"), axis=-1).reshape(-1, 2)
+    cells = [[2 * k, 2 * k + 2, 2 * k + 3, 2 * k + 1] for k in range(4)]
+    bounds = ((0.0, 2.0), (-0.35, 1.0))
+    fallen = rest - np.array([0.0, 0.1]) * (rest[:, :1] > 0.35)
+    pos = np.stack([rest, fallen, fallen])
+    values = {"cells": cells, "bounds": bounds, "spacing": 0.1, "boundary": Boundary.sample(domain_walls(bounds, 0.3), 0.1, 2)}
+    material = ("elastomer", {"elastomer": 1e5})
+    loose = Trajectory.from_numpy(pos, 0.01, *material, **values)
+    clamped = Trajectory.from_numpy(pos, 0.01, *material, prescribed=rest[:, 0] == 0, **values)
+    body = [np.arange(10)]
+    assert boundary_gaps(loose, body)[:, 0] == pytest.approx([0, 0, 0], abs=1e-6)
+    assert boundary_gaps(clamped, body)[:, 0] == pytest.approx([0.2, 0.2, 0.2], abs=1e-6)  # the second cell begins at 0.2
+    assert (boundary_gaps(clamped, [np.arange(4)]) == np.inf).all()
+    assert boundary_gaps(clamped, [np.arange(8, 10)])[:, 0] == pytest.approx([0.35, 0.25, 0.25], abs=1e-6)

@@ -42,6 +42,29 @@ def test_a_level_beam_is_symmetric_about_its_middle() -> None:
     assert [m.axis for m in mirrors(beam(3))] == [0, 1]
 
 
+def clamped(t: Trajectory, ends: str = "left", moves: float = 0.0, pulls: str = "") -> Trajectory:
+    """Hold the nodes at ends of the beam, at rest or with the right end moving outwards, and pull at ends."""
+    x = t.pos[0, :, 0]
+    end = {"left": x < x.min() + 1e-3, "right": x > x.max() - 1e-3}
+    held = np.any([end[name] for name in ends.split()], axis=0)[:, None] & np.ones(2, bool)
+    pos = np.where(held, t.pos[:1], t.pos)
+    pos[:, end["right"], 0] += moves * np.arange(len(pos))[:, None]
+    force = np.zeros_like(pos)
+    for name in pulls.split():
+        force[:, end[name], 0] = 1.0 if name == "right" else -1.0
+    return replace(t, pos=pos, prescribed=held, force=force if pulls else None)
+
+
+@pytest.mark.parametrize("case", [{"ends": "left right"}, {"ends": "left right", "pulls": "left right"}])
+def test_clamps_and_forces_may_be_symmetric(case: dict[str, str]) -> None:
+    assert len(mirrors(clamped(beam(), **case))) == 1
+
+
+@pytest.mark.parametrize("case", [{}, {"ends": "left right", "moves": 0.01}, {"ends": "left right", "pulls": "left"}])
+def test_clamps_and_forces_on_one_side_leave_no_symmetry(case: dict[str, str]) -> None:
+    assert mirrors(clamped(beam(), **case)) == []
+
+
 def spun(t: Trajectory) -> Trajectory:
     return replace(t, vel=t.vel + np.float32(0.5) * (t.pos[:, :, ::-1] - t.pos.mean()))
 
