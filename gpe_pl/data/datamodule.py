@@ -302,7 +302,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         """
         own = -(-count // len(self.parts))
         history = self.builder.config.history
-        return [t for part in self.parts for t in islice(long_enough(part.root, "val", history, part.stride), own)]
+        return [t for part in self.parts for _, t in islice(long_enough(part.root, "val", history, part.stride), own)]
 
     def train_dataloader(self) -> DataLoader:
         trainer = self.trainer

@@ -171,26 +171,29 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
     return stored
 
 
-def long_enough(root: Path | str, split: str, history: int, stride: int = 1) -> Iterator[Trajectory]:
+def long_enough(root: Path | str, split: str, history: int, stride: int = 1) -> Iterator[tuple[int, Trajectory]]:
     """Yield every ``stride``-th frame of the valid trajectories of a split that have at least ``history + 2`` such frames, and warn of the others.
 
     A model needs ``history`` velocities before a frame and one frame to predict.
+
+    Yields:
+        Number of the trajectory among all of the split, so that it does not depend on ``history`` and ``stride``; and the trajectory.
     """
-    for path in shards(root, split):
-        for name in trajectory_names(path):
-            try:
-                trajectory = read_trajectory(path, name, verify=True)
-            except UnsoundError as error:
-                _warn(path, name, error.fault)
-                continue
-            fault = damage(trajectory, stride)
-            trajectory = trajectory.every(stride)
-            if fault is None and trajectory.num_frames < history + 2:
-                fault = f"its {trajectory.num_frames} frames are fewer than the {history + 2} that a start at frame {history} needs"
-            if fault is None:
-                yield trajectory
-            else:
-                _warn(path, name, fault)
+    places = ((path, name) for path in shards(root, split) for name in trajectory_names(path))
+    for number, (path, name) in enumerate(places):
+        try:
+            trajectory = read_trajectory(path, name, verify=True)
+        except UnsoundError as error:
+            _warn(path, name, error.fault)
+            continue
+        fault = damage(trajectory, stride)
+        trajectory = trajectory.every(stride)
+        if fault is None and trajectory.num_frames < history + 2:
+            fault = f"its {trajectory.num_frames} frames are fewer than the {history + 2} that a start at frame {history} needs"
+        if fault is None:
+            yield number, trajectory
+        else:
+            _warn(path, name, fault)
 
 
 def _warn(path: Path, name: str, fault: str) -> None:

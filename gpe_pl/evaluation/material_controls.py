@@ -88,17 +88,17 @@ class MaterialControls:
             )
         self._runs.generate(self._indices, num_workers, on_progress)
 
-    def predictions(self, simulator: Simulator, starts: Sequence[Start], first: int) -> list[dict[str, Trajectory]]:
+    def predictions(self, simulator: Simulator, starts: Sequence[Start], numbers: Sequence[int]) -> list[dict[str, Trajectory]]:
         """Return the model's rollouts of each scene, by name in ``CONTROLS``.
 
         Args:
             simulator: the model, wrapped as for its other rollouts, for example with containment.
-            starts: starts of consecutive scenes with their own values.
-            first: number of the first scene.
+            starts: starts of scenes with their own values.
+            numbers: numbers of the scenes in the split.
         """
         found: list[dict[str, Trajectory]] = [{} for _ in starts]
         for control in CONTROLS:
-            changed = [_changed(start, self.values[first + k][control]) for k, start in enumerate(starts)]
+            changed = [_changed(start, self.values[number][control]) for number, start in zip(numbers, starts, strict=True)]
             for scene, prediction in zip(found, rollouts(simulator, changed), strict=True):
                 scene[control] = prediction
         return found

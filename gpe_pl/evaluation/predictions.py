@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import count, islice
+from itertools import count, islice, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ class PredictedScene:
     """A scene of a split after its rollouts.
 
     Attributes:
+        number: number of the scene in its split. Scenes that are too short for a model have numbers, too.
         trajectory: the stored scene, with the frames before the start.
         truth: the ground truth from the start on.
         predictions: rollouts by model.
@@ -54,6 +55,7 @@ class PredictedScene:
         features: ranges of the quantities that tell whether a scene is unlike others (see ``learned.unlike``).
     """
 
+    number: int
     trajectory: Trajectory
     truth: Trajectory
     predictions: dict[str, Trajectory]
@@ -89,19 +91,21 @@ class Predictor:
     bars: Bars = field(default_factory=lambda: no_bar)
 
     def scenes(self, root: Path, split: Split) -> Iterator[PredictedScene]:
-        """Yield the first ``settings.num_trajectories`` scenes of a split, in its order."""
-        trajectories = islice(long_enough(root, split, self.start_frame, self.stride), self.settings.num_trajectories)
+        """Yield the first ``settings.num_trajectories`` scenes of a split, in its order, without those that are too short."""
+        wanted = self.settings.num_trajectories
+        scenes = takewhile(lambda scene: wanted is None or scene[0] < wanted, long_enough(root, split, self.start_frame, self.stride))
         controls = self.controls if split == UNSEEN else None
-        first = done = 0
+        done = 0
         with self.bars(f"evaluating {split}") as on_progress:
             stored = [-(-t.num_stored // self.stride) for t in open_split(root, split, cache_bytes=0)]
             total = self._num_frames(stored[: self.settings.num_trajectories])
             on_progress(done, total)
-            while batch := list(islice(trajectories, SCENES_AT_ONCE)):
-                for trajectory in batch:
+            while batch := list(islice(scenes, SCENES_AT_ONCE)):
+                numbers, trajectories = [number for number, _ in batch], [trajectory for _, trajectory in batch]
+                for trajectory in trajectories:
                     check_scene(self.settings, trajectory)
-                yield from self._batch(batch, first, controls, _each(on_progress, done, total))
-                first, done = first + len(batch), done + self._num_frames([t.num_frames for t in batch])
+                yield from self._batch(trajectories, numbers, controls, _each(on_progress, done, total))
+                done += self._num_frames([t.num_frames for t in trajectories])
                 on_progress(done, total)  # rollouts that stopped early lack frames
 
     def _num_frames(self, lengths: Sequence[int]) -> int:
@@ -109,9 +113,9 @@ class Predictor:
         return sum(max(0, length - 1 - self.start_frame) for length in lengths)
 
     def _batch(
-        self, trajectories: list[Trajectory], first: int, controls: MaterialControls | None, on_frame: Callable[[], Any]
+        self, trajectories: list[Trajectory], numbers: list[int], controls: MaterialControls | None, on_frame: Callable[[], Any]
     ) -> Iterator[PredictedScene]:
-        """Roll several scenes out at once. ``first`` is the number of the first one in its split; ``on_frame`` is called for each predicted frame."""
+        """Roll several scenes out at once. ``numbers`` are theirs in the split; ``on_frame`` is called for each predicted frame."""
         members, dt = members_of(self.simulator), trajectories[0].metadata.frame_dt
         truths = [trajectory.frames(self.start_frame) for trajectory in trajectories]
         starts = [start_of(self.simulator, self.start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
@@ -134,12 +138,12 @@ class Predictor:
 
         runner = combined(members, lambda member: within_walls(approximate(member)))
         predicted = rollouts(Timed(runner, self.seconds), starts, see)
-        free = self._uncontained(combined(members, approximate), starts, first) if self.settings.containment else predicted
+        free = self._uncontained(combined(members, approximate), starts, numbers) if self.settings.containment else predicted
         is_exact = all(approximate(member) is member for member in members)
         exact = None if is_exact else rollouts(combined(members, within_walls), starts)
-        others = None if controls is None else controls.predictions(runner, starts, first)
+        others = None if controls is None else controls.predictions(runner, starts, numbers)
         for scene, (trajectory, truth) in enumerate(zip(trajectories, truths, strict=True)):
-            prediction, number = predicted[scene], first + scene
+            prediction, number = predicted[scene], numbers[scene]
             predictions = {self.label: prediction} if exact is None else {self.label: prediction, EXACT: exact[scene]}
             for name, baseline in BASELINES.items():
                 start = trajectory.state(self.start_frame, self.start_frame)
@@ -154,12 +158,12 @@ class Predictor:
                 at_values = controls.at_three_values(runner, starts[scene], number, truth, prediction)
             solver_runs = {} if controls is None else controls.solver_runs(number, truth)
             spread_of = np.stack(spreads[scene]) if len(members) > 1 else None
-            yield PredictedScene(trajectory, truth, predictions, counts, solver_runs, at_values, spread_of, watches[scene].found)
+            yield PredictedScene(number, trajectory, truth, predictions, counts, solver_runs, at_values, spread_of, watches[scene].found)
 
-    def _uncontained(self, runner: Simulator, starts: list[Start], first: int) -> list[Trajectory]:
-        """Roll out those of the scenes without containment that ``settings.num_uncontained`` includes."""
+    def _uncontained(self, runner: Simulator, starts: list[Start], numbers: list[int]) -> list[Trajectory]:
+        """Roll out those of the scenes without containment that ``settings.num_uncontained`` includes. Their numbers ascend."""
         wanted = self.settings.num_uncontained
-        return rollouts(runner, starts if wanted is None else starts[: max(0, wanted - first)])
+        return rollouts(runner, [start for start, number in zip(starts, numbers, strict=True) if wanted is None or number < wanted])
 
     def _counts(
         self, trajectory: Trajectory, truth: Trajectory, prediction: Trajectory, free: Trajectory | None, totals: dict[str, float]

@@ -101,8 +101,8 @@ def evaluate(
     for split in settings.splits:
         rows.append(Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split, stride=stride)))
         files = SplitFiles(run_dir, split, label, settings)
-        for number, scene in enumerate(predictor.scenes(root, split)):
-            about = (split, number, scene.truth.metadata.parameter_group, _parameter(scene.trajectory))
+        for scene in predictor.scenes(root, split):
+            about = (split, scene.number, scene.truth.metadata.parameter_group, _parameter(scene.trajectory))
             rows += _rows(scene, about, label, labels(settings.horizons, frame_dt))
             rows += see(scene, about) if see else []
             files.add(scene, about)

@@ -75,7 +75,7 @@ def train(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
 def evaluate(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
     """Read the changed trajectory as evaluation does, and return the message."""
     _store(shard, key, value, seed, folder)
-    return _left_out(lambda: [trajectory.metadata.dataset for trajectory in long_enough(folder, "train", 2)])
+    return _left_out(lambda: [trajectory.metadata.dataset for _, trajectory in long_enough(folder, "train", 2)])
 
 
 def check(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:

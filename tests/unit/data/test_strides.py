@@ -184,5 +184,5 @@ def test_a_stride_that_leaves_no_window_is_refused(stored: dict[str, list[Trajec
             StoreError, match=rf"no trajectory has the 4 frames .*; the longest has . with data.stride={stride}; choose a smaller"
         ):
             module_of(root, stride=stride)
-    assert [t.num_frames for t in long_enough(root, "val", HISTORY, 6)] == [4]
+    assert [t.num_frames for _, t in long_enough(root, "val", HISTORY, 6)] == [4]
     assert [*long_enough(root, "val", HISTORY, 7)] == []

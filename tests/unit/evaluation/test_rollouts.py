@@ -14,8 +14,13 @@ import pytest
 from gpe_pl.evaluation.horizons import labels, time_of
 from gpe_pl.evaluation.metric_rows import MetricsError, Row, read_rows, write_rows
 from gpe_pl.evaluation.predictions import _fraction_outside
-from gpe_pl.evaluation.rollouts import _parameter
+from gpe_pl.evaluation.rollouts import _parameter, evaluate
 from gpe_pl.evaluation.settings import EvaluationSettings, StartError
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.trajectory.store import write_shard
 from gpe_pl.trajectory.trajectory import Termination, Trajectory
 
 
@@ -37,6 +42,22 @@ def test_a_particle_inside_a_wall_counts(inside: Trajectory) -> None:
     pos = inside.pos.copy()
     pos[3, 0] = -0.5
     assert _fraction_outside(replace(inside, pos=pos), 1, 10, 0.0) == pytest.approx(1 / (10 * inside.num_nodes))
+
+
+@pytest.mark.parametrize(("num_trajectories", "numbers"), [(None, {1, 2}), (2, {1})])
+def test_scenes_keep_their_numbers_if_others_are_too_short(
+    new_trajectory: Callable[..., Trajectory], tmp_path: Path, num_trajectories: int | None, numbers: set[int]
+) -> None:
+    """So that tables compare the same scenes of models with other histories or strides."""
+    whole = new_trajectory(num_frames=7, seed=2)
+    scenes = [whole.frames(0, 3), whole.frames(0, 6), whole]
+    write_shard(tmp_path / "data" / "test" / "shard-00000.h5", scenes)
+    builder = GraphBuilder(GraphConfig(history=2), scenes[0].metadata)
+    simulator = LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=4), builder).eval()
+    settings = EvaluationSettings(["test"], num_pictures=0, num_uncontained=2, num_trajectories=num_trajectories)
+    rows = evaluate(simulator, tmp_path / "data", settings, tmp_path / "run")
+    assert {row.trajectory for row in rows} == {-1, *numbers}
+    assert {row.trajectory for row in rows if row.metric == "fraction_outside_uncontained"} == {1}
 
 
 def test_rows_survive_the_file(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 
 def scene_of(truth: Trajectory, prediction: Trajectory) -> PredictedScene:
-    return PredictedScene(truth, truth, {LEARNED: prediction}, {}, {}, [], None, {})
+    return PredictedScene(0, truth, truth, {LEARNED: prediction}, {}, {}, [], None, {})
 
 
 def written(folder: Path, settings: EvaluationSettings, scenes: list[PredictedScene]) -> list[str]:
