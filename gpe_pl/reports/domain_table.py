@@ -32,6 +32,7 @@ from gpe_pl.reports.finished_runs import (
     rollout_errors,
     shared_table,
     shared_trajectories,
+    starts_of,
     values_by_seed,
     with_groups,
 )
@@ -174,25 +175,12 @@ def _check(folder: Path, domains: list[str], by_cell: dict[tuple[str, str], list
                 f"{folder}: models on {domain} were trained or evaluated on different data ({', '.join(keys[:3])}) and do not compare; "
                 "give these runs another name=…"
             )
-        starts = {start for start in map(_start, runs) if start is not None}
+        starts = starts_of(runs)
         if len(starts) > 1:
             raise TableError(
-                f"{folder}: rollouts of models on {domain} start at different times ({', '.join(sorted(starts))}: evaluation.start_time, "
+                f"{folder}: rollouts of models on {domain} start at different times ({', '.join(starts)}: evaluation.start_time, "
                 "or else graph.history) and do not compare; evaluate all with one evaluation.start_time=…"
             )
-
-
-def _start(run: Run) -> str | None:
-    """Return the start of a run's rollouts: its time, or its frame if the length of frames is not known. None if the configuration does not have it."""
-    time, frame_dt = run.config.get("evaluation.start_time"), run.config.get("data.solver.frame_dt")
-    if time is not None:
-        return f"{time:g} s"
-    frame = run.config.get("evaluation.start_frame")  # of earlier versions
-    frame = run.config.get("graph.history") if frame is None else frame
-    if frame is None:
-        return None
-    frame *= run.config.get("data.stride", 1)
-    return f"frame {frame}" if frame_dt is None else f"{frame * frame_dt:g} s"
 
 
 def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, Cell]]:

@@ -6,6 +6,7 @@ rollout, such as ``evaluation.static_friction``.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,9 +14,12 @@ from gpe_pl.evaluation.material_controls import UNSEEN
 from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
+from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError
 from gpe_pl.metrics import bootstrap_interval, bootstrap_ratio, median_of_means
 from gpe_pl.reports.finished_runs import Run, Values, axes_of, rollout_errors, shared_table, shared_trajectories, values_by_seed
 from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, write_material_figure
+
+log = logging.getLogger(__name__)
 
 EVALUATIONS_MD = "table.md"
 NOT_IN_LABELS = ("data", "split", "evaluation.material_controls", "evaluation.num_pictures")
@@ -40,6 +44,9 @@ def labelled(runs: Sequence[Run]) -> Labelled:
     """Return evaluations by domain and split, then by label.
 
     A label names the settings in which the evaluations of a domain differ, or the checkpoint if they differ in none.
+
+    Raises:
+        RunError: evaluations of one split are of different data.
     """
     groups: Labelled = {}
     for domain in dict.fromkeys(str(run.config["data.name"]) for run in runs):
@@ -48,8 +55,26 @@ def labelled(runs: Sequence[Run]) -> Labelled:
         for run in own:
             values = {axis.rpartition(".")[2]: run.config.get(axis) for axis in axes}
             label = ", ".join(f"{name}={value}" for name, value in values.items()) or str(run.config["checkpoint"]).partition(".ckpt")[0]
-            groups.setdefault((domain, str(run.config["split"])), {})[label] = run
+            group = groups.setdefault((domain, str(run.config["split"])), {})
+            _check_data(run, [*group.values()])
+            if (before := group.get(label)) is not None:
+                left_out, kept = sorted((before, run), key=lambda own: len(own.rows))
+                log.warning("%s repeats %s and is left out of the report", left_out.folder, kept.folder)
+                group[label] = kept
+            else:
+                group[label] = run
     return groups
+
+
+def _check_data(run: Run, others: list[Run]) -> None:
+    """Raise ``RunError`` if an evaluation and others of the same split are of different data, by their checksums."""
+    keys, checksum = axes_of([run, *others]), f"{DATA_CHECKSUMS}.{run.config['split']}"
+    if checksum in keys:
+        keys = [key for key in keys if key.startswith("data.")] or [checksum]
+        raise RunError(
+            f"{run.folder} and {others[0].folder} are of different data of one name ({', '.join(keys[:3])}) and do not compare; "
+            "move one of them to a folder of its own"
+        )
 
 
 def _error_lines(groups: Labelled) -> list[str]:

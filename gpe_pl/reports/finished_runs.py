@@ -175,6 +175,23 @@ def replaced_data(runs: list[Run]) -> list[str]:
     return [key for key in keys if len({run.data[key] for run in runs if key in run.data}) > 1]
 
 
+def starts_of(runs: Iterable[Run]) -> list[str]:
+    """Return the different starts of runs' rollouts: times, or frames if the length of frames is not known. Runs whose configuration has none are left out."""
+    return sorted({start for start in map(_start, runs) if start is not None})
+
+
+def _start(run: Run) -> str | None:
+    time, frame_dt = run.config.get("evaluation.start_time"), run.config.get("data.solver.frame_dt")
+    if time is not None:
+        return f"{time:g} s"
+    frame = run.config.get("evaluation.start_frame")  # of earlier versions
+    frame = run.config.get("graph.history") if frame is None else frame
+    if frame is None:
+        return None
+    frame *= run.config.get("data.stride", 1)
+    return f"frame {frame}" if frame_dt is None else f"{frame * frame_dt:g} s"
+
+
 def distinct_runs(runs: list[Run]) -> list[Run]:
     """Return the runs without repetitions: of runs with the same configuration, only the first."""
     first: dict[str, Run] = {}

@@ -10,7 +10,7 @@ from gpe_pl.evaluation.horizons import FULL, time_of
 from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import bootstrap_ratio
-from gpe_pl.reports.finished_runs import Run, shared_table, shared_trajectories, splits_of, values_by_seed
+from gpe_pl.reports.finished_runs import Run, shared_table, shared_trajectories, splits_of, starts_of, values_by_seed
 
 STRIDES_MD = "strides.md"
 """Name of the file that holds only these lines."""
@@ -18,6 +18,10 @@ AXIS = "data.stride"
 LENGTHS = ("training.num_steps", "training.val_interval")
 """Keys that the table leaves out, because they always differ between runs of equal training time."""
 ERROR = "final_mse"
+DIFFERENT_STARTS = (
+    "Rollouts start at different times ({}), so their errors are of different parts of the scenes and do not compare: evaluate all with one "
+    "`evaluation.start_time=…`."
+)
 NOTE = (
     "Position MSE ×1e-3 [m²] at the instant, nodes and axes: median over trajectories and seeds, and the ratio of the means to the first row with its 95 % "
     "bootstrap interval over paired trajectories that no row failed. Failed: rollouts that stopped early. Cost: processor time of rollout steps per simulated "
@@ -35,6 +39,7 @@ def stride_lines(axes: list[str], variants: dict[tuple[str, ...], list[Run]]) ->
     if AXIS not in axes:
         return []
     first, *_ = variants.values()
+    starts = starts_of(run for runs in variants.values() for run in runs)
     instants = _shared_instants(variants)
     shown = [axis not in LENGTHS for axis in axes]
     names = [axis.rpartition(".")[2] for axis in compress(axes, shown)]
@@ -42,7 +47,7 @@ def stride_lines(axes: list[str], variants: dict[tuple[str, ...], list[Run]]) ->
     lines = [table_row(header), "|" + "---|" * len(header)]
     for split in splits_of(first[0]):
         for key, runs in variants.items():
-            errors = [_error(runs, first, split, instant, variants) for instant in instants]
+            errors = [_error(runs, first if len(starts) < 2 else runs, split, instant, variants) for instant in instants]
             ends = [value for seed in values_by_seed(runs, LEARNED, split, ERROR, FULL) for value in seed.values()]
             failed = f"{int(np.sum(~np.isfinite(ends)))} of {len(ends)}"
             edges = [value for seed in values_by_seed(runs, LEARNED, split, "edges_per_node", FULL) for value in seed.values()]
@@ -58,7 +63,8 @@ def stride_lines(axes: list[str], variants: dict[tuple[str, ...], list[Run]]) ->
                     ]
                 )
             )
-    return [*lines, "", NOTE]
+    warning = ["", f"**{DIFFERENT_STARTS.format(', '.join(starts))}**"] if len(starts) > 1 else []
+    return [*lines, "", NOTE, *warning]
 
 
 def _shared_instants(variants: dict[tuple[str, ...], list[Run]]) -> list[str]:

@@ -30,6 +30,7 @@ from gpe_pl.reports.finished_runs import (
     run_name,
     shared_table,
     splits_of,
+    starts_of,
     table_of,
     validation_curve,
     values_by_seed,
@@ -38,7 +39,7 @@ from gpe_pl.reports.finished_runs import (
 from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, verdict, write_material_figure
 from gpe_pl.reports.outcome import outcomes
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
-from gpe_pl.reports.stride_table import STRIDES_MD, stride_lines
+from gpe_pl.reports.stride_table import DIFFERENT_STARTS, STRIDES_MD, stride_lines
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.viz.saving import save_figure
 
@@ -223,6 +224,7 @@ def _markdown(axes: list[str], variants: dict[Variant, list[Run]], ratios: dict[
             *_training_table(names, variants, ratios),
             "",
             *_rollout_table(names, variants, first),
+            *_different_starts(variants),
             *_stress_table(names, variants),
             *_metric_table(names, variants, BODY_COLUMNS, BODY_NOTE),
             *_metric_table(names, variants, LIQUID_COLUMNS, LIQUID_NOTE),
@@ -297,6 +299,15 @@ def _rollout_table(names: list[str], variants: dict[Variant, list[Run]], first: 
     if "test_unseen" in splits:
         note += " `test_unseen` holds material parameters that training did not have, between the trained ones and outside their range."
     return [*lines, "", note]
+
+
+def _different_starts(variants: dict[Variant, list[Run]]) -> list[str]:
+    """Return a warning for rollouts that start at different times; empty if there are none. Variants of several domains may."""
+    by_domain: dict[str, list[Run]] = defaultdict(list)
+    for run in (run for runs in variants.values() for run in runs):
+        by_domain[str(run.config["data.name"])].append(run)
+    starts = next((found for runs in by_domain.values() if len(found := starts_of(runs)) > 1), [])
+    return ["", f"**{DIFFERENT_STARTS.format(', '.join(starts))}**"] if starts else []
 
 
 def _horizons(run: Run) -> list[str]:

@@ -9,6 +9,7 @@ import pytest
 from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, label_of
 from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
 from gpe_pl.files import sealed
+from gpe_pl.files.run_folder import RunError
 from gpe_pl.reports.evaluation_table import labelled
 from gpe_pl.reports.finished_runs import archive, evaluations_below, finished_runs
 from gpe_pl.reports.tables import main
@@ -18,7 +19,7 @@ HARD = (1.0, 2.0, 4.0, 8.0, 3.0, 5.0)
 
 
 def write_evaluation(
-    folder: Path, data: str, factor: float, friction: float | None = None, nearest: float = 0.0, split: str = UNSEEN
+    folder: Path, data: str, factor: float, friction: float | None = None, nearest: float = 0.0, split: str = UNSEEN, seed: int = 0
 ) -> None:
     """Write an evaluation whose errors are those of ``HARD`` times a factor, with controls if ``nearest`` is above 0."""
     folder.mkdir(parents=True)
@@ -26,8 +27,8 @@ def write_evaluation(
     config = {
         "checkpoint": f"{data}.ckpt (sha256 0123)",
         "split": split,
-        "data_sha256": {split: data},
-        "data": {"name": data, "parameters": parameters},
+        "data_sha256": {split: f"{data}{seed}"},
+        "data": {"name": data, "seed": seed, "parameters": parameters},
         "evaluation": {"static_friction": friction},
     }
     sealed.write(folder / "config.json", config)
@@ -78,6 +79,23 @@ def test_each_domain_says_whether_it_reads_the_material(tmp_path: Path) -> None:
     archive(evaluations_below(tmp_path / "runs"), tmp_path / "runs", archived)
     assert main([str(archived)]) == 0
     assert (archived / "table.md").read_text() == text
+
+
+def test_evaluations_of_different_data_of_one_name_are_refused(tmp_path: Path) -> None:
+    write_evaluation(tmp_path / "a", "sand", 1.0, 0.0)
+    write_evaluation(tmp_path / "b", "sand", 1.0, 0.5, seed=1)
+    with pytest.raises(RunError, match=r"b and .*a are of different data of one name \(data.seed\) and do not compare; move one of them"):
+        labelled(evaluations_below(tmp_path))
+    write_evaluation(tmp_path / "c", "sand", 1.0, 0.0, split="test", seed=1)
+    assert len(labelled([run for run in evaluations_below(tmp_path) if run.folder.name != "b"])) == 2  # splits are not compared
+
+
+def test_a_repeated_evaluation_counts_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_evaluation(tmp_path / "a", "sand", 1.0)
+    write_evaluation(tmp_path / "b", "sand", 1.0, nearest=1.0)
+    (group,) = labelled(evaluations_below(tmp_path)).values()
+    assert [run.folder.name for run in group.values()] == ["b"]  # it has more rows
+    assert f"{tmp_path / 'a'} repeats {tmp_path / 'b'} and is left out" in caplog.text
 
 
 def test_training_runs_and_evaluations_are_told_apart(tmp_path: Path) -> None:

@@ -13,12 +13,17 @@ from gpe_pl.rollout.baselines import ConstantVelocity
 from gpe_pl.trajectory.trajectory import Trajectory
 
 
-def write_run(folder: Path, stride: int, errors: dict[str, list[float]], step: float | None) -> None:
+def write_run(folder: Path, stride: int, errors: dict[str, list[float]], step: float | None, start_time: float | None = 0.1) -> None:
     folder.mkdir(parents=True)
-    model = {"_target_": "gpe_pl.models.gpe.GPE"}
-    sealed.write(
-        folder / "config.json", {"seed": 0, "data": {"name": "sand", "stride": stride}, "model": model, "training": {"num_steps": 10}}
-    )
+    config = {
+        "seed": 0,
+        "data": {"name": "sand", "stride": stride, "solver": {"frame_dt": 0.005}},
+        "model": {"_target_": "gpe_pl.models.gpe.GPE"},
+        "graph": {"history": 5},
+        "training": {"num_steps": 10},
+        "evaluation": {"start_time": start_time},
+    }
+    sealed.write(folder / "config.json", config)
     rows = [Row(LEARNED, "test", k, "seen", 20.0, "final_mse", h, v) for h, values in errors.items() for k, v in enumerate(values)]
     rows += [Row(LEARNED, "test", k, "seen", 20.0, "rollout_mse", "full", 1.0) for k in range(3)]
     rows += [Row(LEARNED, "test", k, "seen", 20.0, "edges_per_node", "full", 10.0 * stride) for k in range(3)]
@@ -51,6 +56,21 @@ def test_an_archive_keeps_the_costs(tmp_path: Path) -> None:
         sweep_table.report_sweep(tmp_path / folder, finished_runs(tmp_path / folder))
     tables = [(tmp_path / folder / "strides.md").read_text() for folder in ("runs", "kept")]
     assert tables[0] == tables[1] and "0.8" in tables[0]
+
+
+def test_rollouts_that_start_at_different_times_are_not_compared(tmp_path: Path) -> None:
+    for stride in (1, 4):
+        write_run(tmp_path / str(stride), stride, {"0.1s": [1e-3, 2e-3], "full": [1.0, 1.0]}, step=0.004, start_time=None)
+    sweep_table.report_sweep(tmp_path, finished_runs(tmp_path))
+    strides, table = ((tmp_path / name).read_text() for name in ("strides.md", "table.md"))
+    assert "1.5" in strides and "(×1.00 [" not in strides
+    for text in (strides, table):
+        assert "**Rollouts start at different times (0.025 s, 0.1 s), so their errors are of different parts of the scenes" in text
+    for stride in (1, 4):
+        write_run(tmp_path / "same" / str(stride), stride, {"0.1s": [1e-3, 2e-3], "full": [1.0, 1.0]}, step=0.004)
+    sweep_table.report_sweep(tmp_path / "same", finished_runs(tmp_path / "same"))
+    assert "(×1.00 [" in (tmp_path / "same" / "strides.md").read_text()
+    assert "different times" not in (tmp_path / "same" / "table.md").read_text()
 
 
 def test_what_was_not_measured_is_said(tmp_path: Path) -> None:
