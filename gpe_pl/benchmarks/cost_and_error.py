@@ -15,6 +15,8 @@ Family = Literal["solver", "learned", "trivial"]
 
 WINNING_HORIZONS = 2
 """Number of horizons at which a model has to be below the solvers' curve to win."""
+FEWEST_SCENES = 5
+"""Smallest number of scenes for a win. Over fewer, the interval of two equal simulators is often below 1 by chance."""
 
 
 @dataclass
@@ -128,12 +130,16 @@ def paired_ratio(values: Sequence[float], reference: Sequence[float] | np.ndarra
 
 
 def winners(points: Sequence[Point], horizons: Sequence[str]) -> list[str]:
-    """Return the learned models that win: their 95 % interval lies below the solvers' curve at equal time, at two horizons or more."""
+    """Return the learned models that win: their 95 % interval lies below the solvers' curve at equal time, at two horizons or more.
+
+    A comparison of fewer than ``FEWEST_SCENES`` scenes has no winner.
+    """
     solvers = [p for p in points if p.family == "solver"]
     found = []
     for point in (p for p in points if p.family == "learned"):
         ratios = [ratio_at_cost(point, solvers, h) for h in horizons]
-        if sum(ratio is not None and ratio.high < 1 for ratio in ratios) >= WINNING_HORIZONS:
+        enough = min(len(point.mse[h]) for h in horizons) >= FEWEST_SCENES
+        if enough and sum(ratio is not None and ratio.high < 1 for ratio in ratios) >= WINNING_HORIZONS:
             found.append(point.name)
     return found
 
@@ -141,7 +147,9 @@ def winners(points: Sequence[Point], horizons: Sequence[str]) -> list[str]:
 def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: float) -> float:
     """Return the number of rollouts of ``duration`` [s] after which the training of a model has paid off, compared with a solver of the same error.
 
-    It is infinite if training never pays off, 0 if no solver has so small an error, and NaN if the training time is not known.
+    It is infinite if training never pays off or a rollout failed, 0 if no solver has so small an error, and NaN if the training time is not known.
     """
+    if not np.isfinite(point.error(horizon)):
+        return float("inf")
     saved = (cost_at_error(solvers, point.error(horizon), horizon) - point.cost) * duration
     return float("inf") if saved <= 0 else point.overhead / saved  # of an infinite saving 0

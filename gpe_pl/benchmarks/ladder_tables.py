@@ -41,12 +41,13 @@ def summary(cases: Mapping[str, Sequence[Point]]) -> str:
         learned = [p for p in points if p.family == "learned"]
         nearest = min(learned, key=lambda p: _mean_ratio(p, solvers))
         own = [h for h in horizons if h in nearest.mse]
-        slower = [nearest.cost / cost_at_error(solvers, nearest.error(h), h) for h in own]
+        slower = [nearest.cost / cost_at_error(solvers, nearest.error(h), h) if np.isfinite(nearest.error(h)) else math.inf for h in own]
         cells = [_ratio(ratio_at_cost(nearest, solvers, h)) if h in own else "–" for h in horizons]
         lines.append(table_row([case, nearest.name, *cells, _times(slower), _verdict(nearest, solvers, own)]))
     note = (
         "Error: that of the nearest model over that of a solver of the same cost, with its 95 % interval over paired scenes. Time: that of the model over that "
-        "of a solver of the same error, at the horizons in this order; above 1 the model is slower, and 0 means that no solver is as accurate. Bold: the "
+        "of a solver of the same error, at the horizons in this order; above 1 the model is slower, 0 means that no solver is as accurate, and inf that a "
+        "rollout of the model failed. Bold: the "
         "interval lies below 1."
     )
     return "\n".join([*lines, "", note])
@@ -65,7 +66,7 @@ def _verdict(point: Point, solvers: Sequence[Point], horizons: Sequence[str]) ->
     if winners([*solvers, point], horizons):
         return "**wins**"
     ratios = [ratio for h in horizons if (ratio := ratio_at_cost(point, solvers, h)) is not None]
-    worse = sum(ratio.low > 1 for ratio in ratios)
+    worse = sum(ratio.low > 1 or not np.isfinite(ratio.estimate) for ratio in ratios)
     return f"loses at {worse} of {len(horizons)}" if worse else "level"
 
 

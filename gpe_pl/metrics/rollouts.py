@@ -400,7 +400,9 @@ def _open_records(prediction: Trajectory, ground_truth: Trajectory, horizons: Se
             values["rollout_mse"], values["final_mse"] = float(error[1 : steps + 1].mean()), float(error[steps])
             values |= open_scenes.open_metrics(prediction, ground_truth, steps)
             there = [open_scenes.present(t)[steps] for t in (prediction, ground_truth)]
-            if "energy_distance" in values and all(mask.any() for mask in there):
+            if "energy_distance" in values and not any(mask.any() for mask in there):
+                values["energy_distance"] = 0.0
+            elif "energy_distance" in values and all(mask.any() for mask in there):
                 clouds = [(t.pos[steps, mask], t.mass[mask]) for t, mask in zip((prediction, ground_truth), there, strict=True)]
                 values["energy_distance"] = energy_distance(clouds[0][0], clouds[1][0], clouds[0][1], clouds[1][1])
             if "fraction_outside" in values:

@@ -92,14 +92,16 @@ def test_errors_at_equal_time_are_compared_scene_by_scene() -> None:
     def scenes(name: str, cost: float, errors: list[float], family: Family = "solver") -> Point:
         return Point(name, family, [cost], dict.fromkeys(("20", "50"), errors))
 
-    hard = np.array([1.0, 10.0, 100.0, 3.0])  # scenes differ more than simulators
+    hard = np.array([1.0, 10.0, 100.0, 3.0, 2.0])  # scenes differ more than simulators
     solvers = [scenes("cheap", 1.0, list(4e-3 * hard)), scenes("dear", 4.0, list(1e-3 * hard))]
     better, worse = (scenes(name, 2.0, list(factor * 2e-3 * hard), "learned") for name, factor in (("better", 0.5), ("worse", 1.5)))
     ratio = ratio_at_cost(better, solvers, "20")
     assert ratio is not None and (ratio.low, ratio.estimate, ratio.high) == pytest.approx((0.5, 0.5, 0.5))
-    assert ratio_at_cost(scenes("free", 0.5, [1e-3] * 4, "learned"), solvers, "20") is None
+    assert ratio_at_cost(scenes("free", 0.5, [1e-3] * 5, "learned"), solvers, "20") is None
     once = replace(better, name="once", mse={"20": better.mse["20"], "50": worse.mse["50"]})
     assert winners([*solvers, better, worse, once], ["20", "50"]) == ["better"]
+    few = [replace(p, mse={h: errors[:4] for h, errors in p.mse.items()}) for p in (*solvers, better)]
+    assert winners(few, ["20", "50"]) == []
     dearest = ratio_at_cost(replace(better, seconds=[100.0]), solvers, "20")
     assert dearest is not None and dearest.estimate == pytest.approx(1.0)
 
@@ -110,6 +112,7 @@ def test_training_pays_off_after_what_it_saves() -> None:
     assert break_even(model, LADDER, "full", duration=2.0) == pytest.approx(300.0)
     model.seconds = [3.0]
     assert break_even(model, LADDER, "full", duration=2.0) == float("inf")
+    assert break_even(replace(model, mse={"full": [1e-3, float("inf")]}, seconds=[0.1]), LADDER, "full", duration=2.0) == float("inf")
     for overhead, expected in ((60.0, 0.0), (float("nan"), float("nan"))):  # no solver is as accurate
         exact = replace(point("exact", 9.0, 1e-9, "learned"), overhead=overhead)
         assert break_even(exact, LADDER, "full", duration=2.0) == pytest.approx(expected, nan_ok=True)
@@ -359,7 +362,7 @@ def test_a_shipped_model_takes_part_in_the_case_of_its_data() -> None:
 
 
 def test_the_summary_names_the_nearest_model_and_what_it_lacks() -> None:
-    scenes = np.array([1.0, 10.0, 100.0, 3.0])
+    scenes = np.array([1.0, 10.0, 100.0, 3.0, 2.0])
 
     def of(name: str, cost: float, error: float, family: Family = "solver") -> Point:
         return Point(name, family, [cost], {h: list(error * scenes) for h in ("20", "50")})
@@ -369,10 +372,13 @@ def test_the_summary_names_the_nearest_model_and_what_it_lacks() -> None:
         {
             "won": [*solvers, of("good", 2.0, 1e-3, "learned"), of("bad", 2.0, 9e-3, "learned")],
             "lost": [*solvers, of("slow", 4.0, 2e-3, "learned"), of("broken", 1.0, float("inf"), "learned")],
+            "failed": [*solvers, of("broken", 1.0, float("inf"), "learned")],
         }
     )
     assert "| won | good | **0.50 [0.50, 0.50]** | **0.50 [0.50, 0.50]** | 0.5, 0.5 | **wins** |" in text
     assert "| lost | slow | 2.00 [2.00, 2.00] | 2.00 [2.00, 2.00] | 2, 2 | loses at 2 of 2 |" in text
+    (failed,) = (line for line in text.splitlines() if line.startswith("| failed | broken |"))
+    assert failed.endswith("| inf, inf | loses at 2 of 2 |")
 
 
 def test_emulator_superiority_is_against_the_solver_of_the_labels() -> None:

@@ -64,6 +64,14 @@ def test_errors_count_living_nodes_only(channel: Trajectory) -> None:
     np.testing.assert_allclose(per_frame_mse(moved, channel)[1:], 0.01, rtol=1e-4)
 
 
+def test_an_exact_rollout_that_ends_empty_has_no_error(channel: Trajectory) -> None:
+    assert channel.alive is not None
+    empty = replace(channel, alive=channel.alive & (np.arange(41) < 40)[:, None])
+    assert {r.value for r in rollout_metrics(empty, empty, ["full"])} == {0.0}
+    errors = {r.metric: r.value for r in rollout_metrics(empty, channel, ["full"])}
+    assert errors["mass_error"] == 1.0 and errors["energy_distance"] == float("inf")
+
+
 def test_a_flow_that_stays_has_errors(channel: Trajectory) -> None:
     assert channel.alive is not None
     stays = replace(channel, alive=np.logical_or.accumulate(channel.alive, axis=0))
