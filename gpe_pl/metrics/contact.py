@@ -41,7 +41,7 @@ def _near_held_nodes(trajectory: Trajectory) -> Bool[np.ndarray, "node"]:
     near = np.zeros(trajectory.num_nodes, bool)
     if trajectory.prescribed is None:
         return near
-    held = trajectory.prescribed.any(axis=1)
+    held = np.asarray(trajectory.prescribed.any(axis=1))
     near |= held
     if trajectory.cells is not None:
         near[trajectory.cells[held[trajectory.cells].any(axis=1)]] = True

@@ -40,7 +40,7 @@ def scene(seed: int, num_frames: int = FRAMES, **about: Any) -> PredictedScene:
     scale = bands.scale_of(prediction, None)
     wrong = scale * np.abs(rng.standard_t(3)) * rng.random((num_frames, NODES))
     truth = replace(truth, pos=pos + np.stack([wrong, 0 * wrong], axis=-1))
-    return PredictedScene(truth, truth, {LEARNED: prediction}, {}, {}, [], None, {"speed": (0.0, float(seed))})
+    return PredictedScene(0, truth, truth, {LEARNED: prediction}, {}, {}, [], None, {"speed": (0.0, float(seed))})
 
 
 def calibrated(num_scenes: int, checkpoint: Path, first: int = 0) -> Bands:

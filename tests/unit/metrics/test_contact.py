@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,7 +94,12 @@ def test_a_clamp_at_a_wall_is_no_contact() -> None:
     bounds = ((0.0, 2.0), (-0.35, 1.0))
     fallen = rest - np.array([0.0, 0.1]) * (rest[:, :1] > 0.35)
     pos = np.stack([rest, fallen, fallen])
-    values = {"cells": cells, "bounds": bounds, "spacing": 0.1, "boundary": Boundary.sample(domain_walls(bounds, 0.3), 0.1, 2)}
+    values: dict[str, Any] = {
+        "cells": cells,
+        "bounds": bounds,
+        "spacing": 0.1,
+        "boundary": Boundary.sample(domain_walls(bounds, 0.3), 0.1, 2),
+    }
     material = ("elastomer", {"elastomer": 1e5})
     loose = Trajectory.from_numpy(pos, 0.01, *material, **values)
     clamped = Trajectory.from_numpy(pos, 0.01, *material, prescribed=rest[:, 0] == 0, **values)
