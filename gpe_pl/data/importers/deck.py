@@ -34,7 +34,7 @@ UNSEEN = {
 }
 """Cards that change the motion by what a trajectory cannot hold, and how."""
 READ_OF_LOADS, READ_OF_AMPLITUDES = {"AMPLITUDE", "OP"}, {"NAME", "TIME"}
-"""Parameters of *CLOAD, *DLOAD and *DSLOAD, and of *AMPLITUDE, that are read or change nothing. Others change when or where loads act."""
+"""Parameters of ``*CLOAD``, ``*DLOAD`` and ``*DSLOAD``, and of ``*AMPLITUDE``, that are read or change nothing. Others change when or where loads act."""
 PROCEDURES = (
     "STATIC",
     "FREQUENCY",
@@ -61,7 +61,7 @@ class Deck:
         pressures: amplitude, or None, and pressures by face, of each card.
         gravity: acceleration [3]; None if there is no gravity.
         follows: whether pressures follow the deformation (``NLGEOM``).
-        damped: whether a material has *DAMPING.
+        damped: whether a material has ``*DAMPING``.
     """
 
     density: dict[str, float] = field(default_factory=dict)
@@ -74,7 +74,7 @@ class Deck:
     damped: bool = False
 
     def add_forces(self, amplitude: Amplitude | None, loaded: Iterable[tuple[tuple[int, int], float]]) -> None:
-        """Add a card *CLOAD. Forces on a node along an axis add up, within a card and over cards.
+        """Add a card ``*CLOAD``. Forces on a node along an axis add up, within a card and over cards.
 
         Raises:
             ValueError: an earlier card gives a force there another amplitude. CalculiX would apply the last one to both.
@@ -133,8 +133,8 @@ def read(path: Path) -> Deck:
     """Read a deck.
 
     Raises:
-        Refusal: the file is missing or no deck; it has several steps, no *DYNAMIC or elements other than solids, includes other files, has distributed loads
-            besides gravity and pressures, has gravity that differs between elements or times, or has cards of ``UNSEEN``.
+        Refusal: the file is missing or no deck; it has several steps, no ``*DYNAMIC`` or elements other than solids, includes other files, has distributed
+            loads besides gravity and pressures, has gravity that differs between elements or times, or has cards of ``UNSEEN``.
     """
     try:
         text = path.read_text(encoding="ascii", errors="replace")
