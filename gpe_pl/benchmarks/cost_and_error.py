@@ -138,7 +138,7 @@ def winners(points: Sequence[Point], horizons: Sequence[str]) -> list[str]:
     found = []
     for point in (p for p in points if p.family == "learned"):
         ratios = [ratio_at_cost(point, solvers, h) for h in horizons]
-        enough = min(len(point.mse[h]) for h in horizons) >= FEWEST_SCENES
+        enough = all(len(point.mse[h]) >= FEWEST_SCENES for h in horizons)
         if enough and sum(ratio is not None and ratio.high < 1 for ratio in ratios) >= WINNING_HORIZONS:
             found.append(point.name)
     return found

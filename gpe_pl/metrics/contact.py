@@ -38,11 +38,10 @@ def boundary_gaps(trajectory: Trajectory, bodies: list[Int64[np.ndarray, "_"]]) 
 
 def _near_held_nodes(trajectory: Trajectory) -> Bool[np.ndarray, "node"]:
     """Return a mask of the nodes whose motion is given along an axis, and of those in one cell with them."""
-    near = np.zeros(trajectory.num_nodes, bool)
     if trajectory.prescribed is None:
-        return near
+        return np.zeros(trajectory.num_nodes, bool)
     held = np.asarray(trajectory.prescribed.any(axis=1))
-    near |= held
+    near = held.copy()
     if trajectory.cells is not None:
         near[trajectory.cells[held[trajectory.cells].any(axis=1)]] = True
     return near

@@ -63,17 +63,19 @@ def mirrors(truth: Trajectory) -> list[Mirror]:
         same = same and np.allclose(truth.mass, truth.mass[partner], rtol=1e-3)
         same = same and np.allclose(truth.material_params, truth.material_params[partner], rtol=1e-3, equal_nan=True)
         near = [np.minimum(signed_distance(boundary.shapes, x), metadata.connectivity_radius) for x in (pos, mirror.image(pos))]
-        if same and np.abs(near[0] - near[1]).max() <= close and _has_mirrored_loads(truth, mirror, partner):
-            found.append(Mirror(axis, mirror.offset, partner))
+        with_partners = Mirror(axis, mirror.offset, partner)
+        if same and np.abs(near[0] - near[1]).max() <= close and _has_mirrored_loads(truth, with_partners):
+            found.append(with_partners)
     return found
 
 
-def _has_mirrored_loads(truth: Trajectory, mirror: Mirror, partner: np.ndarray) -> bool:
+def _has_mirrored_loads(truth: Trajectory, mirror: Mirror) -> bool:
     """Tell whether given motions and forces equal their mirror images in all frames."""
-    held, force = truth.prescribed, truth.force
+    held, force, partner = truth.prescribed, truth.force, mirror.partner
     if held is not None:
-        way = (truth.pos.astype(np.float64) - mirror.image(truth.pos.astype(np.float64))[:, partner])[:, held]
-        if (held != held[partner]).any() or np.abs(way).max(initial=0.0) > CLOSE * truth.metadata.spacing:
+        pos = truth.pos.astype(np.float64)
+        distance = np.abs(pos - mirror.image(pos)[:, partner])[:, held]
+        if (held != held[partner]).any() or distance.max(initial=0.0) > CLOSE * truth.metadata.spacing:
             return False
     if force is None:
         return True

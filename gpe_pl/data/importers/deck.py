@@ -77,7 +77,7 @@ class Deck:
         """Add a card ``*CLOAD``. Forces on a node along an axis add up, within a card and over cards.
 
         Raises:
-            ValueError: an earlier card gives a force there another amplitude. CalculiX would apply the last one to both.
+            ValueError: an earlier card gives a force there another amplitude, which CalculiX refuses.
         """
         values: dict[tuple[int, int], float] = {}
         for place, magnitude in loaded:
@@ -87,7 +87,7 @@ class Deck:
             if both and other is not amplitude:
                 node, axis = min(both)
                 raise ValueError(
-                    f"node {node} has forces with different amplitudes along axis {axis}, where CalculiX takes the last one for all of them"
+                    f"node {node} has forces with different amplitudes along axis {axis}, which CalculiX refuses; give them one"
                 )
         self.forces.append((amplitude, values))
 
@@ -143,6 +143,7 @@ def read(path: Path) -> Deck:
     deck, sets, amplitudes, material = Deck(), dict[str, list[int]](), dict[str, Amplitude](), ""
     elements, num_steps, is_dynamic, pulls = _Elements(), 0, False, list[Pull]()
     for keyword, parameters, lines in _cards(text):
+        squeezed = keyword.replace(" ", "")
         try:
             if keyword in ("NODE", "NSET") and "NSET" in parameters:
                 sets.setdefault(parameters["NSET"], []).extend(_members(keyword == "NODE", parameters, lines, sets, "nodes"))
@@ -178,13 +179,13 @@ def read(path: Path) -> Deck:
                     deck.pressures.append((_amplitude(parameters, amplitudes), loaded))
             elif keyword in LOADS:
                 raise Refusal(f"{path.name}: *{keyword} is not read; give forces as *CLOAD and pressures as *DLOAD or *DSLOAD")
-            elif (squeezed := keyword.replace(" ", "")) in UNSEEN:
+            elif squeezed in UNSEEN:
                 raise Refusal(f"{path.name}: *{keyword} {UNSEEN[squeezed]}, which a model would not see; compute the deck without it")
             elif keyword == "TRANSFORM":
                 raise Refusal(f"{path.name}: *TRANSFORM; give held axes and forces along the global axes")
             elif keyword == "INCLUDE":
                 raise Refusal(f"{path.name}: *INCLUDE; write the whole deck into one file")
-            elif (squeezed := keyword.replace(" ", "")) in PROCEDURES:
+            elif squeezed in PROCEDURES:
                 raise Refusal(f"{path.name}: *{keyword} is no dynamics; compute with *DYNAMIC, DIRECT")
             elif keyword == "DYNAMIC":
                 is_dynamic = True
