@@ -108,7 +108,7 @@ def test_a_periodic_data_set_is_imported_trained_on_and_evaluated(
 
 @pytest.mark.slow
 def test_trajectories_of_any_length(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Trajectories too short for the history are left out. The others differ in length."""
+    """Trajectories too short for the history are left out, and rows number the others by their places in the split. They differ in length."""
     lengths = {"train": (14, 3, 28), "val": (3, 14), "test": (20, 3, 14)}
 
     def scene(seed: int, num_frames: int) -> Trajectory:
@@ -121,7 +121,7 @@ def test_trajectories_of_any_length(tmp_path: Path, caplog: pytest.LogCaptureFix
     save_dataset(tmp_path / "data", "any", **splits)  # type: ignore[arg-type]
     trained(tmp_path, "any", "evaluation.num_pictures=1", "evaluation.splits=[test]")
     rows = [r for r in read_rows(tmp_path / "runs" / "fit" / "metrics.csv") if r.model == "learned" and r.horizon == "full"]
-    assert {r.trajectory: r.value for r in rows if r.metric == "num_good_frames"} == {0: 17.0, 1: 11.0}  # after 2 of history
+    assert {r.trajectory: r.value for r in rows if r.metric == "num_good_frames"} == {0: 17.0, 2: 11.0}  # after 2 of history
     assert (tmp_path / "runs" / "fit" / "error_curve_test.png").exists()
     for split, number in (("val", 0), ("test", 1)):
         assert f"{split}/shard-00000.h5:{number:05d}: left out, its 3 frames are fewer than the 4" in caplog.text
