@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count, islice, takewhile
@@ -213,9 +214,10 @@ def start_of(simulator: LearnedSimulator | LearnedEnsemble, start_frame: int, tr
 
 def _cost_of_skipping(prediction: Trajectory, exact: Trajectory, totals: dict[str, float]) -> dict[str, float]:
     """Return what approximate levels change in a rollout, and how much they skip."""
-    shared = prediction.frames(0, min(prediction.num_frames, exact.num_frames))
+    both = min(prediction.num_frames, exact.num_frames)
+    error = per_frame_mse(prediction.frames(0, both), exact.frames(0, both))[1:]
     return {
-        "skipping_mse": float(per_frame_mse(shared, exact)[1:].mean()),
+        "skipping_mse": float(error.mean()) if len(error) else math.inf,
         "fraction_asleep": totals["num_asleep"] / _particle_steps(prediction),
         "lost_impulse": totals["lost_impulse"],
     }

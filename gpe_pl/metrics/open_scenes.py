@@ -18,6 +18,15 @@ def present(trajectory: Trajectory) -> Bool[np.ndarray, "frame node"]:
     return np.ones(trajectory.pos.shape[:2], bool) if trajectory.alive is None else trajectory.alive
 
 
+def places(trajectory: Trajectory) -> Float[np.ndarray, "frame node dim"]:
+    """Return the positions [m]. Before a node enters and after it has left, its place is that of the nearest frame in which it is in the scene."""
+    if trajectory.alive is None:
+        return trajectory.pos
+    first, after = trajectory.alive.argmax(axis=0), trajectory.alive[::-1].argmax(axis=0)
+    frame = np.clip(np.arange(trajectory.num_frames)[:, None], first, trajectory.num_frames - 1 - after)
+    return np.take_along_axis(trajectory.pos, frame[..., None], axis=0)
+
+
 def entering(trajectory: Trajectory) -> Int[np.ndarray, " frame"]:
     """Return how many nodes entered with each frame. None enters with the first."""
     return _changes(trajectory, 1).sum(axis=1)

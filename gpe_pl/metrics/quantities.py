@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gpe_pl.metrics.deformation import strain_energy
-from gpe_pl.metrics.rollouts import mass_motion
+from gpe_pl.metrics.open_scenes import ledger, present
+from gpe_pl.metrics.rollouts import displacement, mass_motion
 from gpe_pl.trajectory.state import von_mises
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -45,7 +46,14 @@ def quantities(trajectory: Trajectory) -> dict[str, Quantity]:
     - ``bounce height``: rise of the centre of mass above its lowest earlier place, since it began to fall [m]; one number: the largest.
     - ``deflection``, in scenes with nodes whose motion is given: largest distance of a node from its rest position [m]; one number: the largest.
     - ``peak stress``: largest von Mises stress of a node [Pa], where there is a stress; one number: the largest.
+
+    Open scenes have the kinetic energy and the momentum of what is in the scene, and
+
+    - ``mass``: mass in the scene [kg]; one number: at the end.
+    - ``outflow``: mass that has left the scene since frame 0 [kg]; one number: at the end.
     """
+    if trajectory.alive is not None:
+        return _of_open_scene(trajectory)
     motion = mass_motion(trajectory, trajectory.num_frames - 1)
     mass, gravity = float(trajectory.mass.sum(dtype=np.float64)), np.asarray(trajectory.metadata.gravity, float)
     found = {
@@ -72,6 +80,20 @@ def quantities(trajectory: Trajectory) -> dict[str, Quantity]:
         peak = von_mises(np.asarray(trajectory.stress.node[1:], np.float64)).max(axis=1)
         found["peak stress"] = Quantity("Pa", peak, float(peak.max()))
     return found
+
+
+def _of_open_scene(trajectory: Trajectory) -> dict[str, Quantity]:
+    there, book, mass = present(trajectory), ledger(trajectory), trajectory.mass.astype(np.float64)
+    pos = trajectory.pos.astype(np.float64)
+    between = displacement(pos[1:], pos[:-1], trajectory.metadata) / trajectory.metadata.frame_dt
+    vel = np.where((there[1:] & there[:-1])[..., None], between, trajectory.vel[1:])  # what has just entered has no frame before
+    left = np.cumsum(book.left_mass)[1:]
+    return {
+        "kinetic energy": Quantity("J", 0.5 * np.einsum("fn,n,fnd,fnd->f", there[1:], mass, vel, vel)),
+        "momentum": Quantity("kg m/s", np.linalg.norm(np.einsum("fn,n,fnd->fd", there[1:], mass, vel), axis=-1)),
+        "mass": Quantity("kg", book.mass[1:], float(book.mass[-1])),
+        "outflow": Quantity("kg", left, float(left[-1])),
+    }
 
 
 def _run_out(

@@ -90,7 +90,8 @@ def displacement(
 def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.ndarray, "frame"]:
     """Return the mean squared position error of every frame [m²], over dimensions and over nodes whose motion is not given along all axes.
 
-    In open scenes, nodes count that are in both at the frame.
+    In open scenes, nodes count that are in either at the frame. Where a node has not yet entered or has left, its place is that of its entry or exit.
+    Nodes that never enter one of the two have no error.
 
     Returns:
         One value per frame, including frame 0 (zero up to rounding). If the rollout stopped early, the array has the length of the ground truth, with ``inf``
@@ -102,13 +103,14 @@ def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.
     _check_comparable(prediction, ground_truth)
     frames = prediction.num_frames
     with np.errstate(invalid="ignore", over="ignore"):  # broken frames are handled below
-        own, true = (_computed(ground_truth, pos) for pos in (prediction.pos, ground_truth.pos[:frames]))
+        own, true = (_computed(ground_truth, pos) for pos in (open_scenes.places(prediction), open_scenes.places(ground_truth)[:frames]))
         square = displacement(own, true, ground_truth.metadata) ** 2
         if prediction.alive is None or ground_truth.alive is None:
             error = square.mean(axis=(1, 2))
         else:
-            both = _computed(ground_truth, prediction.alive & ground_truth.alive[:frames])
-            error = np.where(both, square.mean(axis=2), 0.0).sum(axis=1) / np.maximum(1, both.sum(axis=1))
+            enters = prediction.alive.any(axis=0) & ground_truth.alive.any(axis=0)
+            either = _computed(ground_truth, (prediction.alive | ground_truth.alive[:frames]) & enters)
+            error = np.where(either, square.mean(axis=2), 0.0).sum(axis=1) / np.maximum(1, either.sum(axis=1))
     missing = ground_truth.num_frames - frames if prediction.termination is not None else 0
     # Frames after a broken one are meaningless, even if their numbers are finite.
     broken = np.logical_or.accumulate(~np.isfinite(error))
@@ -324,8 +326,8 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     fraction_outside       1      fraction of predicted particle positions deeper than a thousandth of the spacing in a wall or obstacle
     ====================== ====== ====================================================================================================
 
-    Open scenes have ``rollout_mse`` and ``final_mse`` over the nodes in both rollouts, ``energy_distance`` and ``fraction_outside`` over those that are
-    there, and the metrics of ``open_scenes.open_metrics``.
+    Open scenes have ``rollout_mse`` and ``final_mse`` over the nodes in either rollout (``per_frame_mse``), ``energy_distance`` and ``fraction_outside`` over
+    those that are there, and the metrics of ``open_scenes.open_metrics``.
 
     Energy distance and angular momentum are undefined in periodic domains and left out. ``fraction_outside`` is left out if the boundary has no shapes. Meshes
     also have the metrics of ``bodies.body_metrics``, and liquids those of ``liquids.liquid_metrics`` in frame h.

@@ -36,7 +36,7 @@ from gpe_pl.reports.finished_runs import (
     values_by_seed,
     with_groups,
 )
-from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, write_material_figure
+from gpe_pl.reports.material_table import FEWEST_SCENES, MATERIALS_FIGURE, material_lines, write_material_figure
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.viz.saving import save_figure
@@ -46,6 +46,8 @@ log = logging.getLogger(__name__)
 TABLE_CSV, TABLE_MD, RATIOS_MD, FIGURE = "table1.csv", "table1.md", "table1_ratios.md", "table1.png"
 TABLES = (TABLE_CSV, TABLE_MD, RATIOS_MD, FIGURE, PARAMETER_FIGURE, MATERIALS_FIGURE)
 OWN = "GPE"
+FEWEST_SEEDS = 2
+"""Training seeds of each model that a significant ratio needs. One seed says nothing about the spread between seeds."""
 NOT_LEARNED = 2.0
 """A model has learned only if its error is at least this many times lower than that of the best trivial baseline."""
 
@@ -254,8 +256,9 @@ def _markdown(
         "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training, between the trained ones and outside (where all models get "
         "the nearest trained value): mean over trajectories, median over seeds, 95 % bootstrap interval over both. A rollout that had to be stopped has "
         "failed, and counts as ballistic flight in the same scene. A model that is not twice as good as the best trivial baseline is *not learned* and wins "
-        "nothing. Ratio: over the best baseline that has learned, with its interval, on the same trajectories; bold where that excludes 1. *failed = ∞*: "
-        "the same ratio if the error of a failed rollout were infinite, and the mean with it."
+        "nothing. Ratio: over the best baseline that has learned, with its interval, on the same trajectories; bold where that excludes 1 and has at least "
+        f"{FEWEST_SEEDS} seeds of both and {FEWEST_SCENES} trajectories. *failed = ∞*: the same ratio if the error of a failed rollout were infinite, and the "
+        "mean with it."
     ) + (" Last column: the paper's ratio, from its table 1; its units are not ours." if PAPER_COLUMN in ratios[0] else "")
     materials = material_lines({(d, m): by_cell[d, m] for d in domains for m in models if (d, m) in by_cell})
     return "\n".join([*lines, "", note, *_medians(domains, models, cells), *budget, *(["", *materials] if materials else []), ""])
@@ -304,7 +307,7 @@ def _text(cell: Cell | None) -> str:
 
 
 def _ratio(cells: dict[str, Cell]) -> str:
-    """Return the ratio of GPE's error to that of the best baseline that has learned, with its interval; bold if the interval excludes 1."""
+    """Return the ratio of GPE's error to that of the best baseline that has learned, with its interval; bold if it excludes 1 and there are enough runs."""
     own, others = cells.get(OWN), [c for m, c in cells.items() if m != OWN]
     baselines = [c for c in others if c.is_learned]
     if own is None or not others:
@@ -313,7 +316,8 @@ def _ratio(cells: dict[str, Cell]) -> str:
         return "no baseline learned" if own.is_learned else "no model learned"
     best = min(baselines, key=lambda c: c.interval.estimate)
     i = bootstrap_ratio(own.errors, best.errors, statistic=median_of_means)
-    estimate = f"**{i.estimate:.2f}**" if i.low > 1 or i.high < 1 else f"{i.estimate:.2f}"
+    enough = min(len(own.errors), len(best.errors)) >= FEWEST_SEEDS and own.errors.shape[1] >= FEWEST_SCENES
+    estimate = f"**{i.estimate:.2f}**" if enough and (i.low > 1 or i.high < 1) else f"{i.estimate:.2f}"
     return f"{estimate} [{i.low:.2f}, {i.high:.2f}]" + ("" if own.is_learned else ", not learned")
 
 

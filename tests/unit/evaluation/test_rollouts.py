@@ -13,7 +13,7 @@ import pytest
 
 from gpe_pl.evaluation.horizons import labels, time_of
 from gpe_pl.evaluation.metric_rows import MetricsError, Row, read_rows, write_rows
-from gpe_pl.evaluation.predictions import _fraction_outside
+from gpe_pl.evaluation.predictions import _cost_of_skipping, _fraction_outside
 from gpe_pl.evaluation.rollouts import _parameter, evaluate
 from gpe_pl.evaluation.settings import EvaluationSettings, StartError
 from gpe_pl.graphs.builder import GraphBuilder
@@ -36,6 +36,16 @@ def test_frames_that_a_stopped_rollout_lacks_count_as_outside(inside: Trajectory
     assert _fraction_outside(stopped, 1, 10, 0.0) == pytest.approx(6 / 10)
     assert _fraction_outside(inside, 10, 10, 0.0) == 0.0
     assert _fraction_outside(stopped, 10, 10, 0.0) == 1.0
+
+
+def test_the_cost_of_skipping_is_over_the_frames_of_both(inside: Trajectory) -> None:
+    totals = {"num_asleep": 0.0, "lost_impulse": 0.0}
+    frames = np.arange(11)[:, None, None]
+    exact = replace(inside, pos=inside.pos + np.where(frames == 2, 0.3, 0.0).astype(np.float32))
+    stopped = replace(inside.frames(0, 5), termination=Termination("nan", 5, 0, "frame 5"))
+    for own, other in ((stopped, exact), (exact, stopped)):
+        assert _cost_of_skipping(own, other, totals)["skipping_mse"] == pytest.approx(0.3**2 / 4, rel=1e-4)
+    assert _cost_of_skipping(replace(stopped, pos=stopped.pos[:1], vel=stopped.vel[:1]), inside, totals)["skipping_mse"] == float("inf")
 
 
 def test_a_particle_inside_a_wall_counts(inside: Trajectory) -> None:

@@ -12,6 +12,7 @@ import pytest
 from gpe_pl.export.trajectories import write_vtk
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.metrics.open_scenes import entering, leaving, ledger, level
+from gpe_pl.metrics.quantities import quantities
 from gpe_pl.metrics.rollouts import per_frame_mse, rollout_metrics
 from gpe_pl.rollout.baselines import ConstantVelocity
 from gpe_pl.rollout.loop import rollout
@@ -72,12 +73,43 @@ def test_an_exact_rollout_that_ends_empty_has_no_error(channel: Trajectory) -> N
     assert errors["mass_error"] == 1.0 and errors["energy_distance"] == float("inf")
 
 
+def test_losing_nodes_is_an_error(channel: Trajectory) -> None:
+    """A node that is lost counts where it was last, so a rollout without nodes is not a perfect one."""
+    assert channel.alive is not None
+    frames = np.arange(41)[:, None]
+    lost = replace(channel, alive=channel.alive & (frames < 20))
+    error = per_frame_mse(lost, channel)
+    assert not error[:20].any()
+    stayed = channel.alive[19] & channel.alive[20]
+    never = ~channel.alive[:20].any(axis=0)  # these have no place in the rollout that lost all
+    counted = channel.alive[20] & ~never
+    np.testing.assert_allclose(error[20], stayed[counted].sum() * (DT * 1.0) ** 2 / 2 / counted.sum(), rtol=1e-3)
+    assert (np.diff(error[20:25]) > 0).all()
+    half = replace(channel, alive=channel.alive & ((frames < 20) | (np.arange(channel.num_nodes) % 2 == 0)))
+    assert 0 < per_frame_mse(half, channel)[22] < error[22]
+
+
 def test_a_flow_that_stays_has_errors(channel: Trajectory) -> None:
     assert channel.alive is not None
     stays = replace(channel, alive=np.logical_or.accumulate(channel.alive, axis=0))
     values = {r.metric: r.value for r in rollout_metrics(stays, channel, [40])}
     assert values["outflow_error"] == 1.0
     assert values["mass_error"] == pytest.approx(leaving(channel).sum() / channel.alive[-1].sum())
+    assert values["rollout_mse"] == 0.0  # what should have left has not moved since
+
+
+def test_quantities_are_those_of_what_is_in_the_scene(channel: Trajectory) -> None:
+    assert channel.alive is not None
+    found, count = quantities(channel), channel.alive[1:].sum(axis=1)
+    np.testing.assert_allclose(found["kinetic energy"].over_time, 0.5 * 2.0 * count, rtol=1e-4)
+    np.testing.assert_allclose(found["momentum"].over_time, 2.0 * count, rtol=1e-4)
+    np.testing.assert_allclose(found["mass"].over_time, 2.0 * count)
+    assert found["mass"].value == 2.0 * count[-1]
+    assert found["outflow"].value == 2.0 * leaving(channel).sum() > 0
+    parked = replace(channel, pos=np.where(channel.alive[..., None], channel.pos, 7.0))
+    assert {name: own.over_time.tolist() for name, own in quantities(parked).items()} == {
+        name: own.over_time.tolist() for name, own in found.items()
+    }
 
 
 def test_a_rollout_that_stopped_early_compares_with_a_longer_one(channel: Trajectory, tmp_path: Path) -> None:
