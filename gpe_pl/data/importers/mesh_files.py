@@ -72,7 +72,7 @@ class Frame:
         """Return the frame of a ``meshio.Mesh``; points of their own are cells to meshio and are left out.
 
         Raises:
-            Refusal: a kind of cells is not known.
+            Refusal: a kind of cells is not known, or a cell names a point that the mesh lacks.
         """
         points = np.asarray(mesh.points, np.float64)
         cells: dict[str, list[np.ndarray]] = {}
@@ -87,6 +87,11 @@ class Frame:
             for name, values in mesh.cell_data.items():
                 data[name].setdefault(kind, []).append(np.asarray(values[k]))
         whole = {kind: np.concatenate(parts) for kind, parts in cells.items()}
+        for kind, corners in whole.items():
+            if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
+                raise Refusal(
+                    f"{file} has cells of kind {kind} with points {corners.min()} to {corners.max()}; there are {len(points)} points"
+                )
         if "wedge" in whole:
             whole["wedge"] = _outward(points, whole["wedge"])
         cell_data = {name: {kind: np.concatenate(parts) for kind, parts in own.items()} for name, own in data.items()}

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
+from scipy.sparse import csr_array
 
 from gpe_pl.data.importers.source import Facts, Refusal
 from gpe_pl.schema import CELL_KINDS
@@ -41,6 +42,31 @@ def of_highest_dimension(cells: Mapping[str, np.ndarray]) -> dict[str, np.ndarra
     """Return the cells of the highest dimension by kind. The sizes of others, such as triangles on the surface of tetrahedra, cannot be added to theirs."""
     highest = max((CELL_KINDS[kind][0] for kind in cells), default=0)
     return {kind: own for kind, own in cells.items() if CELL_KINDS[kind][0] == highest}
+
+
+def without_faces(cells: Mapping[str, np.ndarray], num_nodes: int) -> dict[str, np.ndarray]:
+    """Return cells by kind without those whose corners all belong to one cell of a higher dimension, as the triangles that mesh generators write on the surface
+    of tetrahedra.
+    """
+    found = {}
+    for kind, own in cells.items():
+        rows = _corners(own, num_nodes)
+        higher = [_corners(c, num_nodes) for k, c in cells.items() if CELL_KINDS[k][0] > CELL_KINDS[kind][0]]
+        is_face = np.zeros(len(own), bool)
+        for other in higher:
+            is_face |= (rows @ other.T).max(axis=1).toarray().ravel() == own.shape[1]
+        if not is_face.all():
+            found[kind] = own[~is_face]
+    return found
+
+
+def _corners(cells: np.ndarray, num_nodes: int) -> csr_array:
+    """Return the sparse matrix [cell, node] that is 1 at the corners of each cell."""
+    ones, starts = np.ones(cells.size, np.int32), np.arange(0, cells.size + 1, cells.shape[1])
+    found = csr_array((ones, cells.flatten(), starts), shape=(len(cells), num_nodes))
+    found.sum_duplicates()
+    found.data[:] = 1  # collapsed cells have a corner twice
+    return found
 
 
 def mean_at_nodes(rest_pos: np.ndarray, cells: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray]) -> np.ndarray:

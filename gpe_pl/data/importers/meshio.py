@@ -21,7 +21,8 @@ Arrays are found by their names. ``arrays={displacement: U, stress: S}`` names t
 - Parameters of materials at points or in cells, such as ``youngs_modulus`` and ``poisson_ratio``.
 
 Scenes whose points all have the third coordinate 0 are two-dimensional. Cells are lines, triangles, quadrilaterals, tetrahedra, wedges and hexahedra; others
-are refused. The importer needs ``meshio`` (``pip install 'gpe_pl[import]'``).
+are refused. Cells on the surface of others, such as the triangles that mesh generators write beside tetrahedra, are left out. The importer needs ``meshio``
+(``pip install 'gpe_pl[import]'``).
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.data.importers.mesh_files import ENDINGS, Frame, read_series, times_of
-from gpe_pl.data.importers.meshes import add_to_nodes, check_intervals, mean_at_nodes, of_highest_dimension, sizes
+from gpe_pl.data.importers.meshes import add_to_nodes, check_intervals, mean_at_nodes, of_highest_dimension, sizes, without_faces
 from gpe_pl.data.importers.source import (
     Facts,
     ImportFailure,
@@ -118,10 +119,13 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
     pos, rest = _positions(frames, arrays)
     planar = not pos[..., 2:].any() and not rest[..., 2:].any() and not {"tetrahedron", "wedge", "hexahedron"} & {*frames[0].cells}
     dim = 2 if planar else 3
-    pos, rest, cells = pos[..., :dim], rest[..., :dim], frames[0].cells
+    pos, rest, cells = pos[..., :dim], rest[..., :dim], without_faces(frames[0].cells, pos.shape[1])
     number = arrays.of_points("material")
     types = np.zeros(pos.shape[1], int) if number is None else np.rint(number[0].reshape(pos.shape[1])).astype(int)
     nodes = typed(pos, types, {0: "solid"} if cells else {}, settings, cells=cells or None, rest_pos=rest)
+    for kind, own in frames[0].cells.items():
+        if len(cells.get(kind, ())) < len(own):
+            nodes.notes.append(f"cells of kind {kind} whose corners all belong to one other cell of a higher dimension are left out")
     nodes.vel = _vectors(arrays, "velocity", dim)
     nodes.force = _vectors(arrays, "force", dim)
     prescribed = arrays.of_points("prescribed")

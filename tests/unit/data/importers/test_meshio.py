@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset
-from gpe_pl.data.importers.meshes import mean_at_nodes
+from gpe_pl.data.importers.meshes import mean_at_nodes, without_faces
 from gpe_pl.export.trajectories import write_vtk
 from gpe_pl.trajectory.store import iter_trajectories
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -201,6 +201,21 @@ def test_cells_of_the_surface_add_no_mass_and_no_stress(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.mass, DENSITY * SIZE**3 / 6 / 4, rtol=1e-5)
     assert found.stress is not None
     np.testing.assert_allclose(found.stress.node, 3.0)
+    assert found.cells is not None and found.cells.tolist() == [[0, 1, 2, 3]] and found.cell_dim == 3
+    assert "cells of kind triangle whose corners" in next((tmp_path / "data").rglob("report.json")).read_text()
+
+
+def test_only_cells_that_belong_to_a_larger_one_are_left_out() -> None:
+    cells = {
+        "hexahedron": np.array([[0, 1, 2, 3, 4, 5, 6, 6]]),  # collapsed: a corner twice
+        "triangle": np.array([[0, 1, 2], [4, 6, 7]]),
+        "line": np.array([[4, 7], [0, 1], [8, 9]]),
+    }
+    found = without_faces(cells, 10)
+    assert {kind: own.tolist() for kind, own in found.items()} == {
+        "hexahedron": cells["hexahedron"].tolist(), "triangle": [[4, 6, 7]], "line": [[8, 9]],
+    }  # fmt: skip
+    assert without_faces({"tetrahedron": CELLS, "triangle": CELLS[:, :3]}, 12).keys() == {"tetrahedron"}
 
 
 def test_nodes_without_a_solid_have_the_mean_of_their_other_cells() -> None:
@@ -279,6 +294,12 @@ def quadratic(mesh: Any, frame: int) -> Any:
     return meshio.Mesh(POINTS, [("line3", np.array([[0, 1, 2]]))], point_data=mesh.point_data)
 
 
+def beyond(mesh: Any, frame: int) -> Any:
+    cells = CELLS.copy()
+    cells[1, 7] = len(POINTS)
+    return meshio.Mesh(POINTS, [("hexahedron", cells)], point_data=mesh.point_data, cell_data=mesh.cell_data)
+
+
 def flat_stress(mesh: Any, frame: int) -> Any:
     mesh.cell_data["S"] = [np.ones((2, 3))]
     return mesh
@@ -292,6 +313,7 @@ def flat_stress(mesh: Any, frame: int) -> Any:
         (without("velocity", 4), r"step_4.vtu has no array 'velocity', step_0.vtu has one of shape \[12, 3\]"),
         (without("density"), r"has forces but no masses, and a model reads f/m; name them with arrays={mass: …} or arrays={density: …}"),
         (quadratic, r"step_0.vtu has cells of kind line3; cells must be linear: line, triangle"),
+        (beyond, r"step_0.vtu has cells of kind hexahedron with points 0 to 12; there are 12 points"),
         (flat_stress, r"'S' has 3 components, expected 6 \(XX, YY, ZZ, XY, YZ, XZ\) or 9"),
         (lambda mesh, frame: meshio.Mesh(POINTS[:8], [("hexahedron", CELLS[:1])]) if frame == 2 else mesh, r"step_2.vtu has 8 points, step_0.vtu has 12"),
     ],
