@@ -144,6 +144,7 @@ def _identity(cfg: DictConfig, root: Path, simulator: LearnedSimulator) -> dict[
         "checkpoint": prints[0] if len(prints) == 1 else prints,
         **bands,
         "model": {"_target_": simulator.description()["model"], "material_embedding": simulator.model.settings.get("material_embedding")},
+        "graph": {"history": simulator.builder.config.history},  # where rollouts start
         "split": cfg.split,
         DATA_CHECKSUMS: {cfg.split: split_checksum(root, cfg.split)},
         "evaluation": evaluation,

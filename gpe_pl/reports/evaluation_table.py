@@ -16,13 +16,14 @@ from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
 from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError
 from gpe_pl.metrics import bootstrap_interval, bootstrap_ratio, median_of_means
-from gpe_pl.reports.finished_runs import Run, Values, axes_of, rollout_errors, shared_table, shared_trajectories, values_by_seed
+from gpe_pl.reports.finished_runs import Run, Values, axes_of, rollout_errors, shared_table, shared_trajectories, starts_of, values_by_seed
 from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, write_material_figure
+from gpe_pl.reports.stride_table import DIFFERENT_STARTS
 
 log = logging.getLogger(__name__)
 
 EVALUATIONS_MD = "table.md"
-NOT_IN_LABELS = ("data", "split", "evaluation.material_controls", "evaluation.num_pictures")
+NOT_IN_LABELS = ("data", "split", "graph.history", "evaluation.material_controls", "evaluation.num_pictures")
 """Prefixes of configuration keys that labels leave out."""
 
 Labelled = dict[tuple[str, str], dict[str, Run]]
@@ -99,7 +100,8 @@ def _error_lines(groups: Labelled) -> list[str]:
         "Whole rollouts: mean over scenes with its 95 % bootstrap interval, and the ratio to the first model of the same split over the same scenes. A failed "
         "rollout counts as ballistic flight in the same scene. Corrected: fraction of particle-steps that containment moves."
     )
-    return [*lines, "", note]
+    starts = next((found for own in groups.values() if len(found := starts_of(own.values())) > 1), [])
+    return [*lines, "", note, *(["", f"**{DIFFERENT_STARTS.format(', '.join(starts))}**"] if starts else [])]
 
 
 def _over(errors: Values, first: Values) -> str:

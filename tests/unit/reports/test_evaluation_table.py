@@ -12,6 +12,7 @@ from gpe_pl.files import sealed
 from gpe_pl.files.run_folder import RunError
 from gpe_pl.reports.evaluation_table import labelled
 from gpe_pl.reports.finished_runs import archive, evaluations_below, finished_runs
+from gpe_pl.reports.stride_table import DIFFERENT_STARTS
 from gpe_pl.reports.tables import main
 
 HARD = (1.0, 2.0, 4.0, 8.0, 3.0, 5.0)
@@ -19,7 +20,14 @@ HARD = (1.0, 2.0, 4.0, 8.0, 3.0, 5.0)
 
 
 def write_evaluation(
-    folder: Path, data: str, factor: float, friction: float | None = None, nearest: float = 0.0, split: str = UNSEEN, seed: int = 0
+    folder: Path,
+    data: str,
+    factor: float,
+    friction: float | None = None,
+    nearest: float = 0.0,
+    split: str = UNSEEN,
+    seed: int = 0,
+    history: int = 2,
 ) -> None:
     """Write an evaluation whose errors are those of ``HARD`` times a factor, with controls if ``nearest`` is above 0."""
     folder.mkdir(parents=True)
@@ -28,7 +36,8 @@ def write_evaluation(
         "checkpoint": f"{data}.ckpt (sha256 0123)",
         "split": split,
         "data_sha256": {split: f"{data}{seed}"},
-        "data": {"name": data, "seed": seed, "parameters": parameters},
+        "data": {"name": data, "seed": seed, "parameters": parameters, "solver": {"frame_dt": 0.01}},
+        "graph": {"history": history},
         "evaluation": {"static_friction": friction},
     }
     sealed.write(folder / "config.json", config)
@@ -64,6 +73,18 @@ def test_evaluations_of_a_domain_are_compared_with_the_first(tmp_path: Path, cap
         assert second[4].startswith("5.75 [") and second[5] == "1.5 [1.5, 1.5]"
     assert cells(text, "snow", UNSEEN, "snow")[3] == "6"
     assert "reads the material" not in text
+
+
+def test_evaluations_that_start_at_different_times_are_marked(tmp_path: Path) -> None:
+    write_evaluation(tmp_path / "a", "sand", 1.0, 0.0)
+    write_evaluation(tmp_path / "snow", "snow", 1.0, history=5)
+    assert main([str(tmp_path)]) == 0
+    assert "start at" not in (tmp_path / "table.md").read_text()  # one domain need not start as another
+    write_evaluation(tmp_path / "b", "sand", 1.0, 0.5, history=5)
+    assert main([str(tmp_path)]) == 0
+    text = (tmp_path / "table.md").read_text()
+    assert DIFFERENT_STARTS.format("0.02 s, 0.05 s") in text
+    assert cells(text, "sand", UNSEEN, "static_friction=0.5")[5] == "1 [1, 1]"  # labels need no history
 
 
 def test_each_domain_says_whether_it_reads_the_material(tmp_path: Path) -> None:
