@@ -79,7 +79,9 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
             try:
                 start_frame = settings.first_frame(simulator.builder.config.history, scene.frame_dt)
                 controls = material_controls(cfg, settings, root, start_frame)
-                uncertainty = Uncertainty(checkpoints, simulator, settings, cfg.split, split_checksum(root, cfg.split), cfg.calibrate)
+                uncertainty = Uncertainty(
+                    checkpoints, simulator.on(scene), settings, cfg.split, split_checksum(root, cfg.split), cfg.calibrate
+                )
                 evaluated_model = ensemble if len(checkpoints) > 1 else simulator
                 stride, bars = stride_of(evaluated), progress_bar if cfg.trainer.progress else no_bar
                 evaluate(evaluated_model, root, settings, folder, controls=controls, stride=stride, see=uncertainty.see, bars=bars)

@@ -122,7 +122,15 @@ def _calibrations(cfg: DictConfig, settings: Settings) -> tuple[dict[str, dict[s
     if not any(answers.values()) or not (folder / CONFIG).is_file():
         raise ConfigError(f"{key}: has no answers; name the results folder of an earlier run of this command")
     stored, own = config_in(folder / CONFIG), _identity(cfg)
-    compared = ("per_body", "observations", "shooting", "search", *(("checkpoint",) if MODEL in kinds else ()))
+    compared = (
+        "unknowns",
+        "bounds",
+        "per_body",
+        "observations",
+        "shooting",
+        "search",
+        "checkpoint",
+    )  # the checkpoint also gives bounds of the solver
     if different := [name for name in compared if stored.get(name) != own[name]]:
         shown = "; ".join(f"{name}: {stored.get(name)} there, {own[name]} now" for name in different)
         raise ConfigError(f"{key}: was made with other settings ({shown}); identify its scenes again with these")

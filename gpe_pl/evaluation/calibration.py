@@ -30,11 +30,13 @@ class Calibration:
         split_checksum: checksum of the calibration split.
         containment: whether rollouts are contained in walls.
         start_frame: frame of the scenes at which rollouts start.
+        settings: other settings with which rollouts differ from those of the model by default, by key.
     """
 
     split_checksum: str
     containment: bool
     start_frame: int
+    settings: dict[str, bool | int | float] = field(default_factory=dict)
     scenes: list[np.ndarray] = field(default_factory=list)
     spreads: list[np.ndarray] = field(default_factory=list)
     features: list[dict[str, tuple[float, float]]] = field(default_factory=list)
@@ -70,6 +72,7 @@ class Calibration:
             start_frame=self.start_frame,
             frame_dt=frame_dt,
             containment=self.containment,
+            settings=self.settings,
             nodes=factors_of(self.scenes, "nodes"),
             scene=factors_of(self.scenes, "scene"),
             spread=[rounded_up(max(own[frame] for own in self.spreads)) for frame in range(1, shortest)],

@@ -13,7 +13,7 @@ from gpe_pl.evaluation.metric_rows import LEARNED, Row
 from gpe_pl.evaluation.predictions import PredictedScene
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
-from gpe_pl.learned.bands import LEVEL, LEVELS, Bands, Guarantee, errors_of
+from gpe_pl.learned.bands import LEVEL, LEVELS, Bands, Guarantee, errors_of, of_nodes_in
 from gpe_pl.metrics import bootstrap_interval
 from gpe_pl.metrics.conformal import chance_range
 from gpe_pl.viz.coverage import CoverageCurves, coverage_figure
@@ -25,7 +25,7 @@ GUARANTEES: tuple[Guarantee, ...] = ("nodes", "scene")
 
 @dataclass(frozen=True)
 class SceneCoverage:
-    """Coverage of one scene.
+    """Coverage of one scene. Nodes are those that errors are about (``metrics.compared``).
 
     Attributes:
         group: split, and group of unseen material parameters.
@@ -70,14 +70,16 @@ class Coverage:
         """
         prediction, truth = scene.predictions[LEARNED], scene.truth
         metadata, error = truth.metadata, errors_of(prediction, truth)
-        missing = ((0, truth.num_frames - prediction.num_frames), (0, 0))
+        counted = ~np.isnan(error)
+        num_counted = np.maximum(1, counted.sum(axis=1))
         inside, radii = dict[Guarantee, np.ndarray](), dict[Guarantee, np.ndarray]()
         for guarantee in GUARANTEES:
-            bands = [np.pad(self.bands.radius(prediction, scene.spread, level, guarantee), missing) for level in LEVELS]
-            inside[guarantee] = np.stack([(error <= radius).mean(axis=1) for radius in bands])
-            radii[guarantee] = bands[LEVELS.index(LEVEL)].mean(axis=1) / metadata.spacing
+            bands = [of_nodes_in(truth, self.bands.radius(prediction, scene.spread, level, guarantee), 0.0) for level in LEVELS]
+            inside[guarantee] = np.stack([1 - (error > radius).sum(axis=1) / num_counted for radius in bands])
+            radii[guarantee] = np.where(counted, bands[LEVELS.index(LEVEL)], 0.0).sum(axis=1) / num_counted / metadata.spacing
         group = metadata.split if metadata.parameter_group == "seen" else f"{metadata.split}, {metadata.parameter_group}"
-        own = SceneCoverage(group, inside, radii, np.median(error, axis=1) / metadata.spacing)
+        middle = [float(np.median(own[known])) if known.any() else 0.0 for own, known in zip(error, counted, strict=True)]
+        own = SceneCoverage(group, inside, radii, np.array(middle) / metadata.spacing)
         self.scenes.append(own)
         number = LEVELS.index(LEVEL)
         for frame, label in {**horizons, truth.num_frames - 1: FULL}.items():
@@ -128,7 +130,8 @@ class Coverage:
         note = (
             f"Error bands with a level of {per_cent} from {self.bands.num_scenes} scenes of {self.bands.dataset}, {self.bands.split}. Nodes inside: mean "
             f"over scenes of the fraction of nodes inside the narrower bands, with its 95 % bootstrap interval. Enough: at least {per_cent} of a scene's nodes "
-            "inside the wider bands. By chance: where this number lies in 90 % of draws if bands are exact. Radii are means over nodes."
+            "inside the wider bands. Nodes whose motion is given do not count. "
+            "By chance: where this number lies in 90 % of draws if bands are exact. Radii are means over nodes."
         )
         return [*lines, "", note]
 

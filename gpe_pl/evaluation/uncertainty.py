@@ -25,7 +25,7 @@ class Uncertainty:
 
     Args:
         checkpoints: checkpoints of the evaluated model, or of the members of an ensemble.
-        first: the model, or the first member.
+        first: the model, or the first member, for the spacing and the frames of the split (``LearnedSimulator.on``).
         settings: settings of the evaluation.
         split: evaluated split.
         split_checksum: checksum of its scenes.
@@ -48,9 +48,10 @@ class Uncertainty:
         frame_dt = first.builder.metadata.frame_dt
         self.horizons = labels(settings.horizons, frame_dt)
         start_frame = settings.first_frame(first.builder.config.history, frame_dt)
-        self.calibration = Calibration(split_checksum, settings.containment, start_frame) if calibrate else None
+        other = _other_settings(settings, first)
+        self.calibration = Calibration(split_checksum, settings.containment, start_frame, other) if calibrate else None
         stored = None if calibrate else bands.read(*checkpoints)
-        unfit = "" if stored is None else stored.unfit(start_frame, settings.containment, split_checksum)
+        unfit = "" if stored is None else stored.unfit(start_frame, frame_dt, settings.containment, other, split_checksum)
         if unfit:
             log.warning("the coverage of the model's error bands is not measured: %s", unfit)
         self.coverage = None if stored is None or unfit else Coverage(stored)
@@ -90,3 +91,15 @@ class Uncertainty:
         if self.coverage is not None:
             self.coverage.write(folder, self.horizons)
             print((folder / TABLE).read_text(encoding="utf-8"))
+
+
+def _other_settings(settings: EvaluationSettings, simulator: LearnedSimulator) -> dict[str, bool | int | float]:
+    """Return the settings, besides start and containment, with which rollouts differ from those of the model by default, by key."""
+    own = {
+        "clamp_parameters": simulator.clamps_parameters,
+        "static_friction": simulator.static_friction,
+        "mirror_average": simulator.mirror_average,
+    }
+    given = {name: getattr(settings, name) for name in own}
+    changed = {f"evaluation.{name}": value for name, value in given.items() if value is not None and value != own[name]}
+    return {**changed, **{f"rollout.{name}": value for name, value in simulator.skips.approximations.items()}}

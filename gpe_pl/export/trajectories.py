@@ -82,6 +82,8 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
         raise ValueError(f"{path}: a VTK series ends in .pvd")
     if stride < 1:
         raise ValueError(f"stride must be positive, got {stride}")
+    if ground_truth is not None:
+        trajectory = trajectory.with_nodes_of(ground_truth)  # a rollout of an open scene that stopped early has fewer
     if ground_truth is not None and (ground_truth.num_nodes != trajectory.num_nodes or ground_truth.num_frames < trajectory.num_frames):
         raise ValueError(
             f"{path}: the ground truth has {ground_truth.pos.shape[:2]} frames and nodes, the trajectory {trajectory.pos.shape[:2]}"

@@ -18,6 +18,7 @@ from gpe_pl.graphs.neighbors import radius_between
 from gpe_pl.graphs.search import walls_of
 from gpe_pl.graphs.topology import GraphError
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.rollout.flow import FollowsNodes
 from gpe_pl.rollout.loop import SimulationError, Simulator, sound, step_all
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.boundary import search_tree
@@ -198,6 +199,13 @@ class _Repeated:
     frames: int
     inner: Any
 
+    def of_rows(self, rows: np.ndarray) -> _Repeated:
+        """Return what is repeated for other nodes, as ``rollout.flow.FollowsNodes``; nodes that are new or move with an opening are not accelerated."""
+        row = torch.from_numpy(rows).to(self.acceleration.device)
+        acceleration = torch.where((row >= 0)[:, None], self.acceleration[row.clamp(min=0)], 0.0)
+        inner = self.inner.of_rows(rows) if isinstance(self.inner, FollowsNodes) else None
+        return replace(self, acceleration=acceleration, inner=inner)
+
 
 class Repeating(Batched):
     """Simulator that predicts once in ``frames`` frames and repeats the accelerations in between. Contacts that begin or end in between have no effect.
@@ -206,12 +214,17 @@ class Repeating(Batched):
         simulator: simulator that predicts.
         dt: frame interval [s].
         frames: number of frames for which one prediction is used.
+
+    Raises:
+        SimulationError: a scene has rigid bodies.
     """
 
     def __init__(self, simulator: Simulator, dt: float, frames: int) -> None:
         self.simulator, self.dt, self.frames = simulator, dt, frames
 
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
+        if any(state.rigid_body is not None for state in states):  # accelerations of a body that turns would have to turn with it
+            raise SimulationError("rollout.repeat_frames: cannot be more than 1 in scenes with rigid bodies", reason="input")
         repeated = [s.internal if isinstance(s.internal, _Repeated) else None for s in states]
         asked = [
             replace(s, internal=h.inner if h else s.internal) for s, h in zip(states, repeated, strict=True) if h is None or h.frames == 0

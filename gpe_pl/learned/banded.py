@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.bands import LEVEL, Bands, Guarantee
 from gpe_pl.learned.ensemble import LearnedEnsemble, combined, members_of
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -17,6 +20,8 @@ from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Simulator, rollout
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,8 @@ def roll_out_with_bands(
 ) -> BandedRollout:
     """Roll a model or an ensemble forward, with error bands, and warn if the scene is unlike those of the calibration.
 
-    Bands promise coverage for rollouts as in calibration: contained in walls if these were, and from the frame ``bands.start_frame`` of a scene on.
+    Bands promise coverage for rollouts as in calibration: contained in walls if these were, from the frame ``bands.start_frame`` of a scene on, and with the
+    same approximate levels of ``LearnedSimulator.skips``; a warning says if these differ.
 
     Args:
         simulator: trained model, or an ensemble.
@@ -61,19 +67,23 @@ def roll_out_with_bands(
         guard: stops the rollout at the first state that it rejects.
 
     Raises:
-        ValueError: bands of this level are not stored, or are of another number of members.
+        ValueError: bands of this level are not stored, or are of another number of members or of frames of another length.
+        SceneError: the scene does not fit the model.
     """
-    members = members_of(simulator)
+    members = members_of(simulator.on(metadata))
     if bands is not None and len(bands.checkpoints) != len(members):
         raise ValueError(
             f"the bands are of {len(bands.checkpoints)} checkpoints, the simulator has {len(members)}; read those of the same checkpoints"
         )
-    dt, spreads = members[0].builder.metadata.frame_dt, [np.zeros(state.num_nodes)]
+    dt, spreads = metadata.frame_dt, [np.zeros(state.num_nodes)]
+    if bands is not None:
+        _check_fit(bands, dt, members[0])
     watch = Watch(members[0], num_steps)
     watch.see(0, state)
 
     def wrapped(member: LearnedSimulator) -> Simulator:
-        return Contained(member, dt) if bands is None or bands.containment else member
+        runner = approximate(member)
+        return Contained(runner, dt) if bands is None or bands.containment else runner
 
     def see(frame: int, new: State) -> None:
         watch.see(frame, new)
@@ -90,3 +100,15 @@ def roll_out_with_bands(
     unlike.warn("this rollout")
     radius = None if bands is None else bands.radius(trajectory, own_spread, level, guarantee)
     return BandedRollout(trajectory, radius, own_spread, [line for line, _ in unlike.lines.values()])
+
+
+def _check_fit(bands: Bands, frame_dt: float, simulator: LearnedSimulator) -> None:
+    """Raise ``ValueError`` if bands are of frames of another length, and warn if they are of other approximate levels."""
+    if not math.isclose(bands.frame_dt, frame_dt, rel_tol=1e-6):
+        raise ValueError(
+            f"the bands are of frames of {bands.frame_dt:g} s, those of the scene have {frame_dt:g} s; calibrate with such frames"
+        )
+    prefix = "rollout."
+    calibrated = {key.removeprefix(prefix): value for key, value in bands.settings.items() if key.startswith(prefix)}
+    if calibrated != (own := simulator.skips.approximations):
+        log.warning("error bands promise nothing: the calibration skipped %s, this rollout %s", calibrated or "nothing", own or "nothing")

@@ -7,6 +7,9 @@ guarantees for a new scene that is exchangeable with the calibration scenes, in 
 - ``nodes``: the expected fraction of the scene's nodes inside their bands is at least the level.
 - ``scene``: with a probability of at least the level, at least this fraction of the scene's nodes is inside. These bands are wider.
 
+The scene's nodes in a frame are those that errors are about (``metrics.compared``): nodes whose motion is given do not count, and neither do nodes that are
+not in an open scene. A frame without such nodes is covered.
+
 Both hold on average over calibration sets, for one frame at a time and not for all frames at once. They do not hold for scenes unlike the calibration scenes.
 
 ``python -m gpe_pl.evaluate … calibrate=true`` stores bands beside a checkpoint as ``{stem}.bands.json``, and those of an ensemble beside its first checkpoint
@@ -18,8 +21,8 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, field
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -31,8 +34,9 @@ from pydantic.dataclasses import dataclass
 from gpe_pl.files import sealed
 from gpe_pl.learned.pretrained import checkpoint_path
 from gpe_pl.learned.verdicts import checksum
-from gpe_pl.metrics import displacement
+from gpe_pl.metrics import compared, displacement
 from gpe_pl.metrics.conformal import conformal_factor, conformal_factor_of_nodes
+from gpe_pl.metrics.open_scenes import places
 from gpe_pl.trajectory.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -61,6 +65,7 @@ class Bands:
         start_frame: frame of the scenes at which rollouts start.
         frame_dt: time between frames [s].
         containment: whether rollouts are contained in walls.
+        settings: other settings with which rollouts differ from those of the model by default, by key.
         nodes, scene: factors of frames 1, 2, … by level; None where there are too few scenes, or too many rollouts failed.
         spread: largest mean spread of an ensemble over the nodes of a calibration scene, in frames 1, 2, … [m]; empty for a single model.
         features: lowest and highest values of features in calibration scenes, by name (see ``unlike``).
@@ -78,6 +83,7 @@ class Bands:
     scene: dict[str, list[float | None]]
     spread: list[float]
     features: dict[str, tuple[float, float]]
+    settings: dict[str, bool | int | float] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:
@@ -104,7 +110,7 @@ class Bands:
         level: float = LEVEL,
         guarantee: Guarantee = "nodes",
     ) -> Float[np.ndarray, "frame node"]:
-        """Return the radii of the bands [m]. They are infinite in frames without calibration.
+        """Return the radii of the bands [m]. They are infinite in frames without calibration, and 0 for nodes whose motion is given.
 
         Args:
             prediction: rollout from ``start_frame`` of its scene on.
@@ -119,12 +125,20 @@ class Bands:
             raise ValueError("bands of an ensemble need its spread; bands of a single model go without")
         factors = self.factors(level, guarantee)[: prediction.num_frames]
         factors = np.pad(factors, (0, prediction.num_frames - len(factors)), constant_values=math.inf)
-        return factors[:, None] * scale_of(prediction, spread)
+        return np.where(prediction.is_predicted, factors[:, None] * scale_of(prediction, spread), 0.0)
 
-    def unfit(self, start_frame: int, containment: bool, split_checksum: str) -> str:
+    def unfit(
+        self, start_frame: int, frame_dt: float, containment: bool, settings: Mapping[str, bool | int | float], split_checksum: str
+    ) -> str:
         """Return why the bands promise nothing for rollouts of a split, in words for a message; an empty text if they do."""
         if split_checksum == self.split_checksum:
             return "these scenes are the calibration scenes"
+        if not math.isclose(frame_dt, self.frame_dt, rel_tol=1e-6):
+            return f"frames are {frame_dt:g} s long, in calibration {self.frame_dt:g} s"
+        for key in {**self.settings, **settings}:
+            own, known = (values.get(key, "the default") for values in (settings, self.settings))
+            if own != known:
+                return f"{key} is {str(own).lower()}, in calibration {str(known).lower()}"
         if start_frame != self.start_frame:
             return f"rollouts start at frame {start_frame}, in calibration at frame {self.start_frame}"
         if containment != self.containment:
@@ -143,17 +157,26 @@ def scale_of(prediction: Trajectory, spread: Float[np.ndarray, "frame node"] | N
 
 
 def errors_of(prediction: Trajectory, truth: Trajectory) -> Float[np.ndarray, "frame node"]:
-    """Return the distances of nodes from the ground truth [m]. They are infinite in frames that a stopped rollout lacks."""
-    distance = np.linalg.norm(displacement(prediction.pos, truth.pos[: prediction.num_frames], truth.metadata), axis=-1)
+    """Return the distances of the nodes of the ground truth from it [m].
+
+    They are infinite in frames that a stopped rollout lacks, and NaN for nodes that do not count (``metrics.compared``).
+    """
+    prediction = prediction.with_nodes_of(truth)
+    distance = np.linalg.norm(displacement(places(prediction), places(truth)[: prediction.num_frames], truth.metadata), axis=-1)
     missing = truth.num_frames - prediction.num_frames
     distance = np.pad(distance, ((0, missing), (0, 0)), constant_values=math.inf)
-    return np.where(np.isfinite(distance), distance, math.inf)
+    return np.where(compared(prediction, truth), np.where(np.isfinite(distance), distance, math.inf), math.nan)
+
+
+def of_nodes_in(truth: Trajectory, values: Float[np.ndarray, "some_frames some_nodes"], filling: float) -> Float[np.ndarray, "frame node"]:
+    """Return values of a rollout for all frames and nodes of its ground truth; those that a stopped rollout lacks are ``filling``."""
+    missing = [(0, want - have) for want, have in zip(truth.pos.shape[:2], values.shape, strict=True)]
+    return np.pad(values, missing, constant_values=filling)
 
 
 def scores_of(prediction: Trajectory, truth: Trajectory, spread: Float[np.ndarray, "frame node"] | None) -> Float[np.ndarray, "frame node"]:
-    """Return errors over scales, for each frame of the ground truth and each node."""
-    error, scale = errors_of(prediction, truth), scale_of(prediction, spread)
-    return error / np.pad(scale, ((0, len(error) - len(scale)), (0, 0)), constant_values=1.0)
+    """Return errors over scales, for each frame of the ground truth and each node; NaN for nodes that do not count."""
+    return errors_of(prediction, truth) / of_nodes_in(truth, scale_of(prediction, spread), 1.0)
 
 
 def factors_of(scores: Sequence[Float[np.ndarray, "frame _"]], guarantee: Guarantee) -> dict[str, list[float | None]]:
@@ -168,7 +191,8 @@ def factors_of(scores: Sequence[Float[np.ndarray, "frame _"]], guarantee: Guaran
     for level in LEVELS:
         factors = []
         for frame in range(1, num_frames):
-            of_frame = [score[frame] for score in scores]
+            counted = [score[frame][~np.isnan(score[frame])] for score in scores]
+            of_frame = [own if len(own) else np.zeros(1) for own in counted]
             if guarantee == "nodes":
                 factors.append(conformal_factor_of_nodes(of_frame, level))
             else:

@@ -68,7 +68,8 @@ class LearnedSimulator(nn.Module):
         stride: number of stored frames of the training data in a frame of the model. Messages name it.
 
     Attributes:
-        skips: levels of skipping.
+        skips: levels of skipping. Approximate levels act in ``learned.approximate.approximate(simulator)``, which the commands and ``roll_out_with_bands`` use;
+            a rollout of the simulator itself is exact.
         clamps_parameters: clamp material parameters outside the range of training to the nearest trained value. A network is less reliable outside this range.
         static_friction: fraction of the speed that gravity gives in one frame. Nodes on a wall that are slower keep their positions (see
             ``nn.static_friction``). 0 switches this off.

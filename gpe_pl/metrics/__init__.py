@@ -10,6 +10,7 @@ from gpe_pl.metrics.rollouts import Record as Record
 from gpe_pl.metrics.rollouts import RolloutMSE as RolloutMSE
 from gpe_pl.metrics.rollouts import bootstrap_interval as bootstrap_interval
 from gpe_pl.metrics.rollouts import bootstrap_ratio as bootstrap_ratio
+from gpe_pl.metrics.rollouts import compared as compared
 from gpe_pl.metrics.rollouts import displacement as displacement
 from gpe_pl.metrics.rollouts import energy_distance as energy_distance
 from gpe_pl.metrics.rollouts import median_of_means as median_of_means

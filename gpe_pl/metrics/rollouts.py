@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics import Metric
@@ -88,10 +88,9 @@ def displacement(
 
 
 def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.ndarray, "frame"]:
-    """Return the mean squared position error of every frame [m²], over dimensions and over nodes whose motion is not given along all axes.
+    """Return the mean squared position error of every frame [m²], over dimensions and over the nodes that ``compared`` returns.
 
-    In open scenes, nodes count that are in either at the frame. Where a node has not yet entered or has left, its place is that of its entry or exit.
-    Nodes that never enter one of the two have no error.
+    In open scenes, the place of a node that has not yet entered or has left is that of its entry or exit.
 
     Returns:
         One value per frame, including frame 0 (zero up to rounding). If the rollout stopped early, the array has the length of the ground truth, with ``inf``
@@ -103,23 +102,25 @@ def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.
     _check_comparable(prediction, ground_truth)
     frames = prediction.num_frames
     with np.errstate(invalid="ignore", over="ignore"):  # broken frames are handled below
-        own, true = (_computed(ground_truth, pos) for pos in (open_scenes.places(prediction), open_scenes.places(ground_truth)[:frames]))
-        square = displacement(own, true, ground_truth.metadata) ** 2
-        if prediction.alive is None or ground_truth.alive is None:
-            error = square.mean(axis=(1, 2))
-        else:
-            enters = prediction.alive.any(axis=0) & ground_truth.alive.any(axis=0)
-            either = _computed(ground_truth, (prediction.alive | ground_truth.alive[:frames]) & enters)
-            error = np.where(either, square.mean(axis=2), 0.0).sum(axis=1) / np.maximum(1, either.sum(axis=1))
+        square = displacement(open_scenes.places(prediction), open_scenes.places(ground_truth)[:frames], ground_truth.metadata) ** 2
+        counted = compared(prediction, ground_truth)[:frames]
+        error = np.where(counted, square.mean(axis=2), 0.0).sum(axis=1) / np.maximum(1, counted.sum(axis=1))
     missing = ground_truth.num_frames - frames if prediction.termination is not None else 0
     # Frames after a broken one are meaningless, even if their numbers are finite.
     broken = np.logical_or.accumulate(~np.isfinite(error))
     return np.concatenate([np.where(broken, math.inf, error), np.full(missing, math.inf)])
 
 
-def _computed(ground_truth: Trajectory, values: np.ndarray) -> np.ndarray:
-    """Return the values [frame, node, …] of the nodes that a simulator computes, along one axis at least."""
-    return values if ground_truth.prescribed is None else values[:, ground_truth.is_predicted]
+def compared(prediction: Trajectory, ground_truth: Trajectory) -> Bool[np.ndarray, "frame node"]:
+    """Return which nodes the errors of each frame of the ground truth are about: those whose motion is not given along all axes.
+
+    In open scenes, these are the nodes that are in either rollout at the frame, without those that never enter one of the two.
+    """
+    if prediction.alive is None or ground_truth.alive is None:
+        return np.broadcast_to(ground_truth.is_predicted, ground_truth.pos.shape[:2])
+    here = np.pad(prediction.alive, ((0, ground_truth.num_frames - prediction.num_frames), (0, 0)))
+    enters = prediction.alive.any(axis=0) & ground_truth.alive.any(axis=0)
+    return (here | ground_truth.alive) & enters & ground_truth.is_predicted
 
 
 def _check_comparable(prediction: Trajectory, ground_truth: Trajectory) -> None:
@@ -208,7 +209,7 @@ def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps
 
     An error is infinite if that norm is zero and the error is not.
     """
-    own, true = (_computed(ground_truth, t.pos[: num_steps + 1]) for t in (prediction, ground_truth))
+    own, true = (t.pos[: num_steps + 1, ground_truth.is_predicted] for t in (prediction, ground_truth))
     metadata = ground_truth.metadata
     steps, true_steps = displacement(own[1:], own[:-1], metadata), displacement(true[1:], true[:-1], metadata)
     errors = {

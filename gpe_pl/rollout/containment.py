@@ -10,6 +10,7 @@ from array_api_compat import array_namespace, device
 from gpe_pl.geometry.compiled_distance import has_compiled_distance
 from gpe_pl.geometry.compiled_surfaces import NUM_PASSES, put_back
 from gpe_pl.geometry.shapes import Shape, outward_normal, signed_distance, surface_tolerance
+from gpe_pl.rollout.ensemble import Ensemble
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
 from gpe_pl.system.compiled import is_wanted
 from gpe_pl.trajectory.boundary import Array, as_numpy
@@ -32,9 +33,11 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
         Corrected state (the same object if no node was inside) and a mask [node] of the corrected nodes.
     """
     contained, inside = _contain_nodes(state, dt)
-    if state.rigid_body is None or contained is state:
-        return contained, inside
-    return _contain_bodies(state, contained, inside, dt)
+    if state.rigid_body is not None and contained is not state:
+        contained, inside = _contain_bodies(state, contained, inside, dt)
+    if state.loads is not None:  # nodes whose motion is given stay inside
+        inside = inside & ~array_namespace(inside).asarray(state.loads.prescribed.all(axis=1), device=device(inside))
+    return contained, inside
 
 
 def _contain_nodes(state: State, dt: float) -> tuple[State, Array]:
@@ -131,10 +134,20 @@ class Contained:
     Attributes:
         simulator: simulator that makes the steps.
         dt: frame interval [s].
+
+    Raises:
+        ValueError: the simulator is an ensemble, whose members would go through walls unseen.
     """
 
     simulator: Simulator
     dt: float
+
+    def __post_init__(self) -> None:
+        if isinstance(self.simulator, Ensemble):
+            raise ValueError(
+                "containment of an ensemble would move the mean of its members only; contain each member: "
+                "Ensemble(tuple(Contained(member, dt) for member in ensemble.members))"
+            )
 
     def step(self, state: State) -> State:
         return self._contain(self.simulator.step(state))

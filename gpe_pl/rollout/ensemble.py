@@ -20,9 +20,10 @@ from gpe_pl.trajectory.state import State, Stress
 
 @dataclass(frozen=True)
 class _Members:
-    """The states of the members at one frame."""
+    """The states of the members at one frame, and their mean positions [node, dim] in m."""
 
     states: tuple[State, ...]
+    mean: Array
 
 
 @dataclass(frozen=True)
@@ -54,14 +55,24 @@ class Ensemble:
         return [self._combined(items) for items in zip(*columns, strict=True)]
 
     def _states_of(self, state: State) -> tuple[State, ...]:
-        return state.internal.states if isinstance(state.internal, _Members) else (state,) * len(self.members)
+        if not isinstance(state.internal, _Members):
+            return (state,) * len(self.members)
+        mean = state.internal.mean
+        if state.pos is not mean and not bool((state.pos == mean).all()):
+            raise SimulationError(
+                "positions were changed after an ensemble had predicted them, which its members would not see; change the simulators of the members, "
+                "or drop State.internal to start all members from this state",
+                reason="input",
+            )
+        return state.internal.states
 
     def _combined(self, items: tuple[State | SimulationError, ...]) -> State | SimulationError:
         for k, item in enumerate(items):
             if isinstance(item, SimulationError):
                 return SimulationError(f"member {k + 1} of {len(items)}: {item}", reason=item.reason, node=item.node)
         states = tuple(item for item in items if isinstance(item, State))
-        return replace(mean_state(states), internal=_Members(states))
+        mean = mean_state(states)
+        return replace(mean, internal=_Members(states, mean.pos))
 
 
 def mean_state(states: Sequence[State]) -> State:

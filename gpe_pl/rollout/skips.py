@@ -46,4 +46,11 @@ class Skips:
     @property
     def is_exact(self) -> bool:
         """Whether a rollout with these levels equals a rollout without them, up to rounding."""
-        return self.sleep_after is None and self.repeat_frames == 1
+        return not self.approximations
+
+    @property
+    def approximations(self) -> dict[str, int | float]:
+        """Settings of the approximate levels that are on, by name."""
+        names = ["sleep_after", "rest_step_spacings", "rest_step_change_spacings"] if self.sleep_after is not None else []
+        names += ["repeat_frames"] if self.repeat_frames > 1 else []
+        return {name: getattr(self, name) for name in names}

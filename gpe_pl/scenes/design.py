@@ -124,17 +124,16 @@ def design(
 
     Raises:
         SceneFault: the scene is impossible, or does not fit the model.
-        DesignFault: a setting is impossible.
+        DesignFault: a setting is impossible, or every rollout failed.
         PoseError: the obstacle cannot be moved, or touches other parts of the scene within the limits.
     """
     from gpe_pl.evaluation.design.guidance import Guidance
     from gpe_pl.evaluation.design.pose import Obstacle
     from gpe_pl.evaluation.identification.search import SearchSettings, search
     from gpe_pl.geometry.shapes import Sphere
-    from gpe_pl.learned.simulator import LearnedSimulator
 
     _check(scene, target, obstacle, shift, angle, seconds, method, evaluations)
-    simulator = LearnedSimulator.from_checkpoint(model or scene.shipped())
+    simulator = scene.model_for(model or scene.shipped())
     state, metadata = scene.state(simulator)
     name, shape = scene.obstacles[obstacle - 1]
     movable = Obstacle.of(shape, state.boundary)
@@ -145,6 +144,10 @@ def design(
     guidance = Guidance(simulator, start, movable, limits, goal, num_frames, failed=(4 * metadata.longest_side) ** 2)
     before, began = guidance.misfit(np.full(len(guidance.unknowns), 0.5)), time.process_time()
     found = search(guidance, SearchSettings(method=method, num_scanned=3, max_evaluations=evaluations))
+    if not found.misfit < math.log(guidance.failed):
+        raise DesignFault(
+            f"every rollout failed, with all {len(found.tried)} poses that were tried; check the scene, and shorten seconds={seconds}"
+        )
     spent, best = time.process_time() - began, tuple(guidance.pose(found.z).tolist())
     moved = replace(scene, obstacles=tuple((n, movable.moved_shape(best) if n == name else own) for n, own in scene.obstacles))
     distances = {"model": (math.exp(before / 2), math.exp(found.misfit / 2))}

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.training_ranges import stored_ranges
 from gpe_pl.rollout.containment import Contained
@@ -72,7 +73,7 @@ def predicted(simulator: LearnedSimulator, state: State, metadata: Metadata, num
     on_threads = one_thread() if state.num_nodes <= FEW else contextlib.nullcontext()
     with unfused() if is_quick else contextlib.nullcontext(), on_threads, progress_bar(label) as on_progress:
         return rollout(
-            Contained(simulator, metadata.frame_dt),
+            Contained(approximate(simulator), metadata.frame_dt),
             start,
             num_frames,
             metadata,

@@ -316,9 +316,7 @@ class Scene:
         if not 0 < seconds <= 3600:
             raise SceneFault({"seconds": f"must be more than 0 and at most 3600, got {seconds}"})
         chosen = model or self.shipped()
-        simulator = LearnedSimulator.from_checkpoint(chosen)
-        if self.spacing or self.frame_dt:
-            simulator = simulator.at(self.spacing, self.frame_dt)
+        simulator = self.model_for(chosen)
         state, metadata = self.state(simulator)
         num_frames, name = max(2, round(seconds / metadata.frame_dt)), model_name(chosen, ".")
         rollouts: dict[str, Trajectory] = {}
@@ -329,6 +327,18 @@ class Scene:
             rollouts[name] = predicted(simulator, state, metadata, num_frames, f"model {name}")
         first, *_ = rollouts
         return Film(self.title, rollouts[first], {key: rollout for key, rollout in rollouts.items() if key != first})
+
+    def model_for(self, checkpoint: str) -> LearnedSimulator:
+        """Return a model for the spacing and the frames of the scene, if the scene sets them.
+
+        Args:
+            checkpoint: shipped model, folder of a run, or checkpoint.
+
+        Raises:
+            SceneError: the model is of one scale, and the scene sets another.
+        """
+        simulator = LearnedSimulator.from_checkpoint(checkpoint)
+        return simulator.at(self.spacing, self.frame_dt) if self.spacing or self.frame_dt else simulator
 
     def solver_of(self, simulator: LearnedSimulator) -> Any:
         """Return the solver of the model's training data for this box, rounded up to whole cells of its grid."""

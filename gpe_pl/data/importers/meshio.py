@@ -123,8 +123,8 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
     number = arrays.of_points("material")
     types = np.zeros(pos.shape[1], int) if number is None else np.rint(number[0].reshape(pos.shape[1])).astype(int)
     nodes = typed(pos, types, {0: "solid"} if cells else {}, settings, cells=cells or None, rest_pos=rest)
-    for kind, own in frames[0].cells.items():
-        if len(cells.get(kind, ())) < len(own):
+    for kind, corners in frames[0].cells.items():
+        if len(cells.get(kind, ())) < len(corners):
             nodes.notes.append(f"cells of kind {kind} whose corners all belong to one other cell of a higher dimension are left out")
     nodes.vel = _vectors(arrays, "velocity", dim)
     nodes.force = _vectors(arrays, "force", dim)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 import torch
@@ -20,8 +19,8 @@ from gpe_pl.trajectory.state import State
 NAMES = ("shift x", "shift y", "angle")
 """Numbers of a pose: shift [m] and angle [rad]."""
 UNITS = ("m", "m", "deg")
-NUM_CHECKED = 5
-"""Number of values of each unknown at which contacts with other parts of the scene are looked for."""
+CLOSEST = 0.5
+"""Poses between two checked ones move no point of the obstacle by more than this distance from one of them [spacings]."""
 
 
 class PoseError(GpeError, ValueError):
@@ -96,13 +95,22 @@ class Obstacle:
             PoseError: at some pose it touches a wall, another obstacle or a node; the message names the pose.
         """
         others = tuple(other for other in boundary.shapes if other != self.shape)
-        for pose in product(*(np.linspace(-limit, limit, NUM_CHECKED) if limit else (0.0,) for limit in limits)):
-            shape = self.moved_shape(pose)
+        reach = float(np.linalg.norm(_corners(self.shape) - self.centre, axis=1).max())
+        cells = [(np.zeros(3), np.asarray(limits, np.float64))]  # middle and half widths of sets of poses
+        while cells:
+            pose, half = cells.pop()
+            shape = self.moved_shape(pose.tolist())
             points, _ = shape.sample(spacing)
-            touched = ["a wall or another obstacle"] if others and bool((signed_distance(others, points) <= 0).any()) else []
-            touched += ["the material"] if bool((shape.signed_distance(pos) <= 0).any()) else []
-            if touched:
-                raise PoseError(f"shift, angle: at {text(pose)} the obstacle touches {touched[0]}; choose smaller limits, or move it")
+            to_walls = float(signed_distance(others, points).min()) if others else math.inf
+            to_nodes = float(shape.signed_distance(pos).min(initial=math.inf))
+            if min(to_walls, to_nodes) <= 0:
+                touched = "a wall or another obstacle" if to_walls <= 0 else "the material"
+                raise PoseError(f"shift, angle: at {text(pose.tolist())} the obstacle touches {touched}; choose smaller limits, or move it")
+            moves = np.array([half[0], half[1], reach * half[2]])  # how far poses of the set move points of the obstacle
+            if math.hypot(moves[0], moves[1]) + moves[2] > max(min(to_walls, to_nodes), CLOSEST * spacing):
+                is_widest = np.arange(3) == int(moves.argmax())
+                step, smaller = np.where(is_widest, half / 2, 0.0), np.where(is_widest, half / 2, half)
+                cells += [(pose - step, smaller), (pose + step, smaller)]
 
 
 def text(pose: Sequence[float]) -> str:

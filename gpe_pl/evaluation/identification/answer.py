@@ -76,6 +76,7 @@ class Answer:
         method: ``gradient`` or ``derivative_free``.
         gradients: result of the check of gradients; empty if there was none.
         misfit: smallest misfit.
+        is_unfinished: whether the search stopped at its largest number of evaluations, so that other values may fit better.
         num_windows, length: number of rollouts, and of frames of each.
         num_evaluations, num_gradients: numbers of misfits and gradients that were computed.
         seconds, processor_seconds: time of the search and the intervals.
@@ -98,6 +99,7 @@ class Answer:
     seconds: float
     processor_seconds: float
     tried: tuple[tuple[float, ...], ...]
+    is_unfinished: bool = False
 
     def __getitem__(self, name: str) -> Value:
         """Return the answer for an unknown by its name, such as ``sand.friction_angle``."""
@@ -105,9 +107,11 @@ class Answer:
 
     @property
     def warning(self) -> str:
-        """What a reader should know about the fit; empty if the rollouts are nearer than ``POOR`` to the motion."""
+        """What a reader should know about the fit; empty if the search has ended and the rollouts are nearer than ``POOR`` to the motion."""
         error = math.exp(self.misfit / 2)
-        return "" if error < POOR else f"{self.simulator} does not fit: its rollouts are {error:.2g} spacings away from the motion"
+        found = [] if error < POOR else [f"{self.simulator} does not fit: its rollouts are {error:.2g} spacings away from the motion"]
+        found += [f"{self.simulator} stopped at search.max_evaluations, other values may fit better"] if self.is_unfinished else []
+        return "; ".join(found)
 
     def __str__(self) -> str:
         lines = [f"{value.label} {value.text}" + (f", at the {value.at_bound} bound" if value.at_bound else "") for value in self.values]
@@ -134,6 +138,7 @@ def read_answer(path: Path) -> Answer:
         AnswerError: another version of the package wrote it.
     """
     found: dict[str, Any] = sealed.read(path, ADVICE)
+    found.setdefault("is_unfinished", False)  # earlier versions did not say
     is_own = found.keys() == Answer.__dataclass_fields__.keys()
     if not is_own or any(value.keys() != Value.__dataclass_fields__.keys() for value in found["values"]):
         raise AnswerError(f"{path}: is an answer of another version; {ADVICE}")

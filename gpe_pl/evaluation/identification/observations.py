@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int
 from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
 from scipy.interpolate import CubicSpline
@@ -55,6 +55,9 @@ class Observations:
         trajectory: positions in all frames; values that were not observed are ignored. Material parameters that are not sought have to be right.
         seen: observed nodes of each frame [frame, node].
         noise: standard deviation of the noise in the positions [m].
+
+    Raises:
+        ObservationError: flags do not fit the trajectory, too few frames are observed, or the scene is open.
     """
 
     trajectory: Trajectory
@@ -66,6 +69,8 @@ class Observations:
             raise ObservationError(
                 f"seen [frame, node] is {list(self.seen.shape)}, the trajectory has {list(self.trajectory.pos.shape[:2])}; give one flag per node and frame"
             )
+        if self.trajectory.alive is not None:
+            raise ObservationError("nodes enter or leave the scene, which no search follows; observe a scene without openings")
         if self.seen.any(axis=1).sum() < 2:
             raise ObservationError("fewer than 2 frames have observed nodes; observe more frames")
 
@@ -94,13 +99,18 @@ class Observations:
         return digest(arrays, stored_attributes(self.trajectory))
 
     @cached_property
+    def frames(self) -> Int[np.ndarray, "observed"]:
+        """Frames with observed nodes."""
+        return np.flatnonzero(self.seen.any(axis=1))
+
+    @cached_property
     def first_frame(self) -> int:
         """First frame that is known: 0 if nodes are hidden, because the start has to be known then."""
-        return 0 if self.has_hidden_nodes else int(np.flatnonzero(self.seen.any(axis=1))[0])
+        return 0 if self.has_hidden_nodes else int(self.frames[0])
 
     @cached_property
     def last_frame(self) -> int:
-        return int(np.flatnonzero(self.seen.any(axis=1))[-1])
+        return int(self.frames[-1])
 
     @cached_property
     def completed(self) -> Trajectory:
@@ -108,20 +118,30 @@ class Observations:
 
         If nodes are hidden, it is the trajectory itself.
         """
-        frames = np.flatnonzero(self.seen.any(axis=1))
+        frames, runs = self.frames, _even_runs(self.frames)
         is_complete = len(frames) == self.trajectory.num_frames
-        if self.noise and (self.has_hidden_nodes or len(frames) <= SMOOTHED_FRAMES):
-            why = "some nodes are hidden" if self.has_hidden_nodes else f"fewer than {SMOOTHED_FRAMES + 1} frames are observed"
+        if self.noise and (self.has_hidden_nodes or min(map(len, runs)) <= SMOOTHED_FRAMES):
+            why = "some nodes are hidden"
+            if not self.has_hidden_nodes:
+                why = f"fewer than {SMOOTHED_FRAMES + 1} frames are observed" + (" in a row without a gap" if len(runs) > 1 else "")
             log.warning("observations.noise: rollouts start from the noisy positions as they are, because %s", why)
         if self.has_hidden_nodes or (is_complete and self.noise == 0):
             return self.trajectory
         if self.trajectory.metadata.periodicity:
             raise ObservationError("missing frames and noise are not supported in periodic domains; observe every frame without noise")
         pos: Float64[np.ndarray, "frame node dim"] = self.trajectory.pos.astype(np.float64)
-        if self.noise and len(frames) > SMOOTHED_FRAMES:
-            pos[frames] = savgol_filter(pos[frames], SMOOTHED_FRAMES, SMOOTHED_ORDER, axis=0)
+        if self.noise:
+            for run in runs:
+                if len(run) > SMOOTHED_FRAMES:
+                    pos[run] = savgol_filter(pos[run], SMOOTHED_FRAMES, SMOOTHED_ORDER, axis=0)
         known, vel = np.arange(frames[0], frames[-1] + 1), self.trajectory.vel.astype(np.float64)
         if not is_complete:
             pos[known] = CubicSpline(frames, pos[frames], axis=0)(known)
         vel[known] = np.gradient(pos[known], self.trajectory.metadata.frame_dt, axis=0, edge_order=2 if len(known) > 2 else 1)
         return replace(self.trajectory, pos=pos, vel=vel)
+
+
+def _even_runs(frames: Int[np.ndarray, "observed"]) -> list[Int[np.ndarray, "_"]]:
+    """Return observed frames in runs without a gap: neighbours in a run are the smallest interval of all apart."""
+    intervals = np.diff(frames)
+    return np.split(frames, np.flatnonzero(intervals > intervals.min()) + 1)

@@ -71,7 +71,7 @@ def identify(
     seen = observed if isinstance(observed, Observations) else Observations.of(observed)
     began, processor = time.monotonic(), time.process_time()
     ranges = {**(trained_bounds(simulator) if isinstance(simulator, LearnedSimulator) else {}), **(bounds or {})}
-    rollouts = shooting(simulator, seen, unknowns_of(seen.completed, unknowns, ranges, per_body), shooting_settings)
+    rollouts = shooting(simulator, seen, unknowns_of(seen.completed, unknowns, ranges, per_body, seen.first_frame), shooting_settings)
     found = search(rollouts, search_settings, on_progress)
     if not found.misfit < math.log(FAILED):
         raise ShootingError(
@@ -103,6 +103,7 @@ def _answer(scene: str, rollouts: Shooting, found: Found, calibration: Mapping[s
         method=found.method,
         gradients="" if found.check is None else str(found.check),
         misfit=found.misfit,
+        is_unfinished=found.is_unfinished,
         num_windows=len(rollouts.starts),
         length=rollouts.length,
         num_evaluations=rollouts.num_evaluations,

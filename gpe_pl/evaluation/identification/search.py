@@ -57,6 +57,7 @@ class Found:
         method: ``gradient`` or ``derivative_free``.
         check: check of gradients, if there was one.
         tried: numbers from 0 to 1 and misfit of every evaluation.
+        is_unfinished: whether the search stopped at ``SearchSettings.max_evaluations``.
     """
 
     z: Float64[np.ndarray, "unknown"]
@@ -64,6 +65,7 @@ class Found:
     method: str
     check: GradientCheck | None
     tried: list[tuple[np.ndarray, float]] = field(default_factory=list)
+    is_unfinished: bool = False
 
 
 def search(objective: Objective, settings: SearchSettings | None = None, on_progress: Progress | None = None) -> Found:
@@ -82,6 +84,7 @@ def search(objective: Objective, settings: SearchSettings | None = None, on_prog
         return note(z, objective.misfit(np.clip(z, 0.0, 1.0)))
 
     start, width = _scanned(misfit, number, s.num_scanned)
+    num_scanned = len(tried)
     base = min(value for _, value in tried)
 
     def relative(z: np.ndarray) -> float:
@@ -99,16 +102,17 @@ def search(objective: Objective, settings: SearchSettings | None = None, on_prog
             return ratio, ratio * gradient
 
         options = {"maxfun": s.max_evaluations, "ftol": 1e-6, "gtol": 1e-4}
-        minimize(with_gradient, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * number, options=options)
+        result = minimize(with_gradient, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * number, options=options)
     elif number == 1:
         bounds = (max(0.0, start[0] - width), min(1.0, start[0] + width))
         options = {"xatol": TOLERANCE, "maxiter": s.max_evaluations}
-        minimize_scalar(lambda z: relative(np.array([z])), bounds=bounds, method="bounded", options=options)
+        result = minimize_scalar(lambda z: relative(np.array([z])), bounds=bounds, method="bounded", options=options)
     else:
         options = {"initial_tr_radius": width, "final_tr_radius": TOLERANCE, "maxfev": s.max_evaluations}
-        minimize(relative, start, method="COBYQA", bounds=[(0.0, 1.0)] * number, options=options)
+        result = minimize(relative, start, method="COBYQA", bounds=[(0.0, 1.0)] * number, options=options)
+    is_unfinished = not result.success and len(tried) - num_scanned >= s.max_evaluations
     z, least = min(tried, key=lambda pair: pair[1])
-    return Found(np.clip(z, 0.0, 1.0), least, method, check, tried)
+    return Found(np.clip(z, 0.0, 1.0), least, method, check, tried, is_unfinished)
 
 
 def _scanned(misfit: Callable[[np.ndarray], float], number: int, num_scanned: int) -> tuple[np.ndarray, float]:

@@ -167,6 +167,9 @@ def shooting(simulator: Simulator, observations: Observations, unknowns: Unknown
     last = observations.last_frame - length
     number = 1 if is_single else min(s.num_windows, 1 + (last - first) // max(1, length // 2))
     frames = sorted({int(f) for f in np.linspace(first, last if number > 1 else first, number).round()})
+    observed = observations.frames[(observations.frames >= first) & (observations.frames <= last)]
+    if not is_single and len(observed):  # interpolated states in long gaps can be far from the truth
+        frames = sorted({int(observed[np.abs(observed - f).argmin()]) for f in frames})
     if not any(observations.seen[f + 1 : f + length + 1].any() for f in frames):
         raise ShootingError(f"no frame within shooting.horizon={s.horizon} of the starts {frames} is observed; choose a longer horizon")
     if isinstance(simulator, LearnedSimulator):

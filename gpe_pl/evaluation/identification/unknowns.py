@@ -9,11 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 from array_api_compat import array_namespace
-from scipy.spatial import cKDTree
 
 from gpe_pl.errors import GpeError
 from gpe_pl.errors.printable import did_you_mean
+from gpe_pl.metrics import displacement
 from gpe_pl.schema import MATERIALS, MaterialParameter, node_code
+from gpe_pl.trajectory.boundary import search_tree
 from gpe_pl.trajectory.cells import bodies, components
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -25,7 +26,7 @@ GRAVITY: Literal["gravity"] = "gravity"
 BODY_SPACINGS = 1.5
 """Nodes without cells belong to one body if they are nearer than this in the first frame [spacings]."""
 STEEPEST = 45.0
-"""Largest angle between the sought direction of gravity and the stored one [deg]."""
+"""Largest tilt of the sought direction of gravity from the stored one towards each other axis [deg]. Two such tilts in 3D make 54.7 degrees together."""
 AT_BOUND = 0.01
 """Answers nearer to a bound than this fraction of the range count as lying at the bound."""
 
@@ -120,7 +121,7 @@ class Unknowns:
         """Return a state with the values at ``z`` [unknown]; all arrays are of the same library. Gradients pass to ``z``."""
         params, vel, gravity = 1 * state.material_params, 1 * state.vel, 1 * state.gravity
         history = None if state.velocity_history is None else 1 * state.velocity_history
-        tilt = 0 * gravity
+        tilted = 0 * gravity
         for k, unknown in enumerate(self.items):
             value = unknown.at(z[k])
             if unknown.kind == "parameter":
@@ -130,15 +131,25 @@ class Unknowns:
                 if history is not None:
                     history[unknown.nodes, :, unknown.place] = value
             else:
-                tilt[unknown.place] = array_namespace(z).tan(value * (math.pi / 180))
+                tilted = tilted + array_namespace(z).tan(value * (math.pi / 180)) * _across(gravity, unknown.place)
         if any(u.kind == GRAVITY for u in self.items):
             size = (gravity**2).sum() ** 0.5
-            gravity = gravity + size * tilt
+            gravity = gravity + size * tilted
             gravity = gravity * (size / (gravity**2).sum() ** 0.5)
         return replace(state, material_params=params, vel=vel, velocity_history=history, gravity=gravity)
 
 
-def unknowns_of(trajectory: Trajectory, wanted: Sequence[str] | None, ranges: Bounds, per_body: bool = False) -> Unknowns:
+def _across(gravity: Any, axis: int) -> Any:
+    """Return the unit vector [dim] across gravity towards an axis, so that tilts are angles also if gravity is not along an axis."""
+    direction = gravity / (gravity**2).sum() ** 0.5
+    found = -direction[axis] * direction
+    found[axis] = found[axis] + 1
+    return found / (found**2).sum() ** 0.5
+
+
+def unknowns_of(
+    trajectory: Trajectory, wanted: Sequence[str] | None, ranges: Bounds, per_body: bool = False, first_frame: int = 0
+) -> Unknowns:
     """Return the unknowns of a scene.
 
     Args:
@@ -146,6 +157,7 @@ def unknowns_of(trajectory: Trajectory, wanted: Sequence[str] | None, ranges: Bo
         wanted: names ``MATERIAL``, ``MATERIAL.PARAMETER``, ``velocity`` or ``gravity``; None takes all parameters of all materials of the scene.
         ranges: bounds of material parameters by name ``MATERIAL.PARAMETER``.
         per_body: give each body values of its own.
+        first_frame: frame in which nodes near each other are one body.
 
     Raises:
         UnknownError: the scene has no such unknown, or a parameter has no bounds. The message names it.
@@ -153,7 +165,7 @@ def unknowns_of(trajectory: Trajectory, wanted: Sequence[str] | None, ranges: Bo
     found: list[Unknown] = []
     if misspelt := sorted(set(ranges) - PARAMETERS):
         raise UnknownError(f"bounds: {misspelt[0]!r} is no MATERIAL.PARAMETER{did_you_mean(misspelt[0], sorted(PARAMETERS))}")
-    groups = scene_bodies(trajectory) if per_body else []
+    groups = scene_bodies(trajectory, first_frame) if per_body else []
     for name in materials_of(trajectory) if wanted is None else wanted:
         material, _, parameter = name.partition(".")
         if material in (VELOCITY, GRAVITY) and parameter:
@@ -172,16 +184,15 @@ def unknowns_of(trajectory: Trajectory, wanted: Sequence[str] | None, ranges: Bo
     return Unknowns(tuple(found))
 
 
-def scene_bodies(trajectory: Trajectory) -> list[np.ndarray]:
-    """Return the nodes of each body in the first frame: connected by cells, or within ``BODY_SPACINGS`` and of one material."""
+def scene_bodies(trajectory: Trajectory, frame: int = 0) -> list[np.ndarray]:
+    """Return the nodes of each body in a frame: connected by cells, or within ``BODY_SPACINGS`` and of one material."""
     num_nodes = trajectory.num_nodes
     meshes = [] if trajectory.cells is None else bodies(trajectory.cells, num_nodes)
     free = np.setdiff1d(np.arange(num_nodes), np.concatenate([*meshes, np.zeros(0, dtype=np.int64)]).astype(np.int64))
     if not len(free):
         return meshes
-    pairs = cKDTree(trajectory.pos[0, free].astype(np.float64)).query_pairs(
-        BODY_SPACINGS * trajectory.metadata.spacing, output_type="ndarray"
-    )
+    tree = search_tree(trajectory.pos[frame, free].astype(np.float64), trajectory.metadata.periodicity)
+    pairs = tree.query_pairs(BODY_SPACINGS * trajectory.metadata.spacing, output_type="ndarray")
     kind = trajectory.node_type[free]
     pairs = pairs[kind[pairs[:, 0]] == kind[pairs[:, 1]]].astype(np.int64)
     number, label = components(pairs.T, len(free))
@@ -236,7 +247,8 @@ def _check_range(name: str, spec: MaterialParameter, bounds: tuple[float, float]
 
 
 def _velocities(trajectory: Trajectory, groups: list[np.ndarray]) -> list[Unknown]:
-    steps = np.abs(np.diff(trajectory.pos.astype(np.float64), axis=0)) / trajectory.metadata.frame_dt
+    pos = trajectory.pos.astype(np.float64)
+    steps = np.abs(displacement(pos[1:], pos[:-1], trajectory.metadata)) / trajectory.metadata.frame_dt
     steps = steps[np.isfinite(steps).all(axis=(1, 2))]
     if not len(steps):
         raise UnknownError(f"unknowns: {VELOCITY}: the trajectory has no two successive frames with finite positions")

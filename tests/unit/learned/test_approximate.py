@@ -12,7 +12,7 @@ import torch
 
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned.approximate import Repeating, Sleeping, approximate
+from gpe_pl.learned.approximate import Repeating, Sleeping, _Repeated, _Rest, approximate
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
@@ -20,7 +20,7 @@ from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard
-from gpe_pl.rollout.loop import Start, rollout, rollouts
+from gpe_pl.rollout.loop import SimulationError, Start, rollout, rollouts
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.trajectory.state import State
 from tests import scenes
@@ -239,3 +239,21 @@ def test_periodic_scenes_sleep_and_are_repeated_across_the_seam(repeat_frames: i
     assert after.num_asleep == 20
     torch.testing.assert_close(after.vel[20:], full.vel[20:], rtol=0, atol=1e-6 * float(full.vel.abs().max()))
     assert float(approximate(simulated).step(after).pos[:, 0].max()) < 1.0
+
+
+def test_predictions_are_not_repeated_for_rigid_bodies() -> None:
+    """Accelerations of the nodes of a body that turns would deform it."""
+    simulated = simulator(scenes.builder(), sleep_after=None, repeat_frames=2)
+    start = scenes.state().to_torch()
+    body = replace(start, rigid_body=torch.zeros(start.num_nodes, dtype=torch.int64))
+    with pytest.raises(SimulationError, match="rollout.repeat_frames: cannot be more than 1 in scenes with rigid bodies"):
+        approximate(simulated).step(body)
+
+
+def test_what_is_repeated_follows_nodes_that_enter_and_leave() -> None:
+    inner = _Rest(torch.tensor([3, 1, 2]))
+    repeated = _Repeated(torch.tensor([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]), 2, inner)
+    found = repeated.of_rows(np.array([2, -1, 0]))
+    assert found.acceleration.tolist() == [[3.0, 0.0], [0.0, 0.0], [1.0, 0.0]] and found.frames == 2
+    assert found.inner.count.tolist() == [2, 0, 3]
+    assert replace(repeated, inner="of a solver").of_rows(np.array([0])).inner is None

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from gpe_pl.evaluation.calibration import Calibration, CalibrationError
 from gpe_pl.evaluation.coverage import Coverage
@@ -17,11 +18,14 @@ from gpe_pl.evaluation.metric_rows import LEARNED, Row
 from gpe_pl.evaluation.predictions import PredictedScene
 from gpe_pl.files.sealed import SealError
 from gpe_pl.learned import bands
+from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.banded import roll_out_with_bands
 from gpe_pl.learned.bands import Bands
 from gpe_pl.learned.ensemble import LearnedEnsemble
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import rollout
+from gpe_pl.rollout.skips import Skips
 from gpe_pl.trajectory.trajectory import Termination, Trajectory
 from tests.conftest import make_trajectory
 from tests.scenes import metadata, state
@@ -48,6 +52,11 @@ def calibrated(num_scenes: int, checkpoint: Path, first: int = 0) -> Bands:
     for seed in range(first, first + num_scenes):
         calibration.add(scene(seed))
     return calibration.bands([checkpoint])
+
+
+def of_frames(own: Bands) -> Bands:
+    """Return bands for the frames of ``tests.scenes``."""
+    return replace(own, frame_dt=metadata().frame_dt)
 
 
 def covered(own: Bands, scenes: list[PredictedScene]) -> list[Row]:
@@ -125,9 +134,63 @@ def test_bands_survive_the_file(checkpoint: Path, tmp_path: Path) -> None:
 
 def test_bands_name_what_they_do_not_hold_for(checkpoint: Path) -> None:
     own = calibrated(19, checkpoint)
-    assert own.unfit(2, True, "other") == ""
-    assert "calibration scenes" in own.unfit(2, True, "abc")
-    assert "frame 3" in own.unfit(3, True, "other") and "containment=false" in own.unfit(2, False, "other")
+    dt = own.frame_dt
+    assert own.unfit(2, dt, True, {}, "other") == ""
+    assert "calibration scenes" in own.unfit(2, dt, True, {}, "abc")
+    assert "frame 3" in own.unfit(3, dt, True, {}, "other") and "containment=false" in own.unfit(2, dt, False, {}, "other")
+    assert f"frames are {2 * dt:g} s long" in own.unfit(2, 2 * dt, True, {}, "other")
+    key = "rollout.repeat_frames"
+    assert own.unfit(2, dt, True, {key: 4}, "other") == f"{key} is 4, in calibration the default"
+    skipped = replace(own, settings={key: 4})
+    assert skipped.unfit(2, dt, True, {}, "other") == f"{key} is the default, in calibration 4"
+    assert skipped.unfit(2, dt, True, {key: 4}, "other") == ""
+
+
+def test_older_bands_are_of_rollouts_with_the_settings_of_the_model(checkpoint: Path) -> None:
+    values = asdict(calibrated(19, checkpoint))
+    del values["settings"]
+    assert TypeAdapter(Bands).validate_json(json.dumps(values)).settings == {}
+
+
+@pytest.mark.parametrize("kind", ["absent", "held"])
+def test_only_nodes_that_errors_are_about_are_covered(checkpoint: Path, kind: str) -> None:
+    """Three quarters of the nodes have no error: they are not in the scene, or their motion is given. The others are covered as promised."""
+    idle = np.arange(NODES) < 6
+
+    def thinned(seed: int) -> PredictedScene:
+        own = scene(seed)
+        truth, prediction = own.truth, own.predictions[LEARNED]
+        truth = replace(truth, pos=np.where(idle[:, None], prediction.pos, truth.pos))
+        if kind == "held":
+            about: dict[str, Any] = {"prescribed": np.repeat(idle[:, None], 2, axis=1)}
+        else:
+            about = {"alive": np.tile(~idle, (FRAMES, 1))}
+        return replace(own, truth=replace(truth, **about), predictions={LEARNED: replace(prediction, **about)})
+
+    fractions = []
+    for k in range(12):
+        calibration = Calibration("abc", True, 2)
+        for seed in range(1000 * k, 1000 * k + 19):
+            calibration.add(thinned(seed))
+        own = calibration.bands([checkpoint])
+        for seed in range(1000 * k + 100, 1000 * k + 110):
+            each = thinned(seed)
+            error = bands.errors_of(each.predictions[LEARNED], each.truth)
+            assert (np.isnan(error) == idle).all()
+            radius = own.radius(each.predictions[LEARNED])
+            fractions.append((error[2, 6:] <= radius[2, 6:]).mean())
+            rows = {r.metric: r.value for r in covered(own, [each]) if r.horizon == "0.02s"}
+            assert rows["fraction_in_bands"] == fractions[-1] and rows["band_radius"] == pytest.approx(radius[2, 6:].mean())
+            assert kind == "absent" or not radius[:, :6].any()
+    assert 0.85 < np.mean(fractions) < 0.97
+
+
+def test_a_scene_without_nodes_is_covered(checkpoint: Path) -> None:
+    own, each = calibrated(19, checkpoint), scene(50)
+    nobody: dict[str, Any] = {"alive": np.zeros((FRAMES, NODES), bool)}
+    each = replace(each, truth=replace(each.truth, **nobody), predictions={LEARNED: replace(each.predictions[LEARNED], **nobody)})
+    rows = {r.metric: r.value for r in covered(own, [each]) if r.horizon == "0.02s"}
+    assert rows == {"fraction_in_bands": 1.0, "enough_in_bands": 1.0, "band_radius": 0.0}
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-9, 1.0, 3.14159, 99995.0, 123456.0])
@@ -144,10 +207,25 @@ def test_an_ensemble_of_equal_members_is_its_member(checkpoint: Path) -> None:
     np.testing.assert_allclose(both.trajectory.pos, alone.trajectory.pos, atol=1e-9)
     assert alone.spread is None and both.spread is not None and both.spread.shape == both.trajectory.pos.shape[:2]
     assert float(both.spread.max()) < 1e-9
-    own = calibrated(19, checkpoint)
+    own = of_frames(calibrated(19, checkpoint))
     banded = roll_out_with_bands(single, start, 3, metadata(), own)
     assert banded.radius is not None and banded.radius.shape == alone.trajectory.pos.shape[:2] and (banded.radius[1:] > 0).all()
     assert math.isfinite(float(banded.radius.max()))
     with pytest.raises(ValueError, match="bands are of 1 checkpoints, the simulator has 2"):
         roll_out_with_bands(ensemble, start, 3, metadata(), own)
     assert isinstance(rollout(ensemble, start, 2, metadata()), Trajectory)
+
+
+def test_bands_of_other_frames_are_refused_and_of_other_levels_marked(checkpoint: Path, caplog: pytest.LogCaptureFixture) -> None:
+    single, own = LearnedSimulator.from_checkpoint(checkpoint), of_frames(calibrated(19, checkpoint))
+    start = single.standing(state().to_torch(), metadata())
+    with pytest.raises(ValueError, match=r"the bands are of frames of 0.02 s, those of the scene have 0.005 s"):
+        roll_out_with_bands(single, start, 3, metadata(), replace(own, frame_dt=0.02))
+    exact = roll_out_with_bands(single, start, 4, metadata(), own)
+    assert "promise nothing" not in caplog.text
+    single.skips = Skips(repeat_frames=4)
+    repeated = roll_out_with_bands(single, start, 4, metadata(), own)
+    assert "the calibration skipped nothing, this rollout {'repeat_frames': 4}" in caplog.text
+    expected = rollout(Contained(approximate(single), metadata().frame_dt), start, 4, metadata())
+    np.testing.assert_array_equal(repeated.trajectory.pos, expected.pos)
+    assert np.abs(repeated.trajectory.pos - exact.trajectory.pos).max() > 0

@@ -119,6 +119,7 @@ def test_a_rollout_that_stopped_early_compares_with_a_longer_one(channel: Trajec
     assert values["rollout_mse", 5] == 0.0
     assert values["rollout_mse", 20] == float("inf")
     write_viewer(tmp_path / "short.html", channel, {"short": short})
+    write_vtk(tmp_path / "short.pvd", short, channel)
 
 
 def test_the_viewer_hides_nodes_that_are_not_there(channel: Trajectory, tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from gpe_pl.geometry.shapes import (
 from gpe_pl.rollout.containment import Contained, contain
 from gpe_pl.system.compiled import unfused
 from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.state import State
 from tests import scenes
 
@@ -226,6 +227,16 @@ def test_contained_states_know_how_many_nodes_were_corrected() -> None:
         counts.append(state.num_corrected)
     # the third step would end 5 mm inside: it goes only half as far, and that speed is lost on the wall in the fourth
     assert counts == [0, 0, 2, 2, 0, 0]
+
+
+def test_nodes_whose_motion_is_given_are_not_corrected() -> None:
+    pos = np.array([[0.5, -0.02], [0.3, -0.02], [0.5, 0.5]])
+    state = moved(WALLS, pos, pos)
+    held = np.array([[True, True], [True, False], [False, False]])  # the second is free to rise
+    found, corrected = contain(replace(state, loads=Loads(held, pos[None, :2])), DT)
+    assert corrected.tolist() == [False, True, False]
+    np.testing.assert_array_equal(found.pos[[0, 2]], pos[[0, 2]])
+    assert found.pos[1, 1] >= 0
 
 
 @pytest.mark.parametrize("shapes", [WALLS, WALLS + OBSTACLES + HOUSES, WALLS + WEDGES], ids=["walls", "obstacles", "wedges"])

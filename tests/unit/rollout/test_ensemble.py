@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.ensemble import Ensemble, mean_state, spread
 from gpe_pl.rollout.loop import SimulationError, Simulator, Start, rollout, rollouts, steps
 from gpe_pl.trajectory.state import State
@@ -68,3 +69,16 @@ def test_means_are_taken_across_a_periodic_seam(new_trajectory: object) -> None:
 def test_a_member_that_fails_in_a_single_step_raises(trajectory: Trajectory) -> None:
     with pytest.raises(SimulationError, match="member 1 of 2"):
         Ensemble((Growing(1.0, fails_at=-1.0), Growing(1.0))).step(trajectory.state(0))
+
+
+def test_containment_of_the_mean_alone_is_refused(trajectory: Trajectory) -> None:
+    """Members would go through walls, and the mean would jump to their other side."""
+    ensemble = Ensemble((Growing(0.5), Growing(1.5)))
+    with pytest.raises(ValueError, match="contain each member"):
+        Contained(ensemble, 0.01)
+    after = Ensemble(tuple(Contained(member, 0.01) for member in ensemble.members)).step(trajectory.state(0))
+    again = replace(after, pos=after.pos.copy())
+    np.testing.assert_array_equal(ensemble.step(again).pos, ensemble.step(after).pos)
+    with pytest.raises(SimulationError, match="positions were changed after an ensemble"):
+        ensemble.step(replace(after, pos=after.pos + 1e-3))
+    assert isinstance(ensemble.step(replace(after, pos=after.pos + 1e-3, internal=None)), State)

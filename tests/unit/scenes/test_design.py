@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.shapes import Polygon
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.scenes import design as verb
 from gpe_pl.scenes.design import Design, design
 from gpe_pl.scenes.obstacles import Circle
@@ -47,6 +49,17 @@ def test_impossible_designs_are_refused_in_one_line(seek: Callable[[], Any], mes
     with pytest.raises(GpeError) as caught:
         seek()
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_design_has_the_scale_of_its_scene() -> None:
+    """Models of one scale refuse another spacing, as in predictions."""
+    other = scene()
+    other = replace(other, spacing=2 * LearnedSimulator.from_checkpoint("sand").builder.metadata.spacing)
+    with pytest.raises(GpeError) as predicted:
+        other.predict()
+    with pytest.raises(GpeError) as designed:
+        design(other, (0.8, 0.1))
+    assert str(designed.value) == str(predicted.value)
 
 
 @pytest.mark.slow

@@ -98,6 +98,16 @@ def test_poses_that_touch_something_are_refused() -> None:
         obstacle.check_limits((0.0, 0.0, 1.5), own, beside, scenes.SPACING)
 
 
+def test_a_corner_that_touches_between_coarse_poses_is_found() -> None:
+    """A square looks the same at all multiples of a right angle; its corners reach farther in between."""
+    square = Box((0.45, 0.01), (0.55, 0.11), 0.3)
+    own, nothing = boundary(square), np.empty((0, 2))
+    with pytest.raises(PoseError, match="the obstacle touches a wall"):
+        Obstacle.of(square, own).check_limits((0.0, 0.0, math.pi), own, nothing, 0.02)
+    higher = Box((0.45, 0.04), (0.55, 0.14), 0.3)
+    Obstacle.of(higher, boundary(higher)).check_limits((0.0, 0.0, math.pi), boundary(higher), nothing, 0.02)
+
+
 @pytest.mark.parametrize("shape", [Box((0.4, 0.0), (0.6, 0.2), 0.3), Wall((0.0, 1.0), 0.1, (0.0, 0.0), (1.0, 1.0), 0.3)])
 def test_obstacles_that_cannot_be_moved_are_refused(shape: Any) -> None:
     with pytest.raises(PoseError, match="touches a wall or another obstacle|discs, boxes and polygons"):

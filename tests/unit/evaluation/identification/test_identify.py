@@ -22,7 +22,7 @@ from gpe_pl.evaluation.identification.results import Task, write_table
 from gpe_pl.evaluation.identification.scene import SolverError, identify, solver_of
 from gpe_pl.evaluation.identification.search import SearchSettings
 from gpe_pl.evaluation.identification.shooting import Shooting, ShootingError, ShootingSettings, shooting
-from gpe_pl.evaluation.identification.unknowns import UnknownError, unknowns_of
+from gpe_pl.evaluation.identification.unknowns import UnknownError, Unknowns, scene_bodies, unknowns_of
 from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.files import sealed
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -120,6 +120,76 @@ def test_values_that_were_not_observed_are_not_used() -> None:
     observed = Observations.of(seen, ObservationSettings(every=3))
     wrong = np.where(observed.seen[..., None], seen.pos, np.float32(7.0))
     assert np.abs(Observations(replace(seen, pos=wrong), observed.seen).completed.pos[:39] - seen.pos[:39]).max() < 1e-3
+
+
+def test_noise_is_smoothed_on_each_side_of_a_gap() -> None:
+    """A filter that took the frames beside a gap for neighbours would move them by decimetres."""
+    seen = thrown(num_frames=100)
+    flags = np.ones(seen.pos.shape[:2], dtype=bool)
+    flags[30:60] = False
+    found = Observations(seen, flags, noise=1e-4).completed
+    assert np.abs(found.pos - seen.pos).max() < 1e-3
+    whole = Observations(seen, np.ones_like(flags), noise=1e-4).completed
+    np.testing.assert_array_equal(found.pos[:25], whole.pos[:25])
+    starts = shooting(Drag(), Observations(seen, flags), unknowns_of(seen, None, BOUNDS)).starts
+    assert len(starts) > 2 and all(flags[frame].all() for frame in starts)
+
+
+def test_short_runs_of_frames_are_not_smoothed(caplog: pytest.LogCaptureFixture) -> None:
+    seen = thrown()
+    flags = np.ones(seen.pos.shape[:2], dtype=bool)
+    flags[8:12] = False
+    found = Observations(seen, flags, noise=1e-4).completed
+    np.testing.assert_array_equal(found.pos[:8], seen.pos[:8])
+    assert "fewer than 12 frames are observed in a row without a gap" in caplog.text
+
+
+def test_nodes_that_cross_a_seam_have_the_velocity_and_the_body_of_their_motion() -> None:
+    seen = thrown()
+    wrapped = replace(
+        seen, pos=(seen.pos + 2.9) % 3.0, metadata=replace(seen.metadata, bounds=((0.0, 3.0), (0.0, 3.0)), periodic=(True, True))
+    )
+    assert np.abs(np.diff(wrapped.pos, axis=0)).max() > 1.0
+    plain, across = (unknowns_of(own, ["velocity"], {}).items for own in (seen, wrapped))
+    assert [unknown.high for unknown in across] == pytest.approx([unknown.high for unknown in plain], rel=1e-3)
+    first = replace(seen, pos=seen.pos - seen.pos[:, 4:5])  # the first body lies across both seams
+    around = replace(wrapped, pos=first.pos % 3.0)
+    assert np.ptp(around.pos[0, :9]) > 1.0
+    assert sorted(map(len, scene_bodies(around))) == [9, 9]
+
+
+def test_bodies_are_those_of_the_first_observed_frame() -> None:
+    seen = thrown(np.repeat([24.0, 38.0], 9))
+    flags, hidden = np.ones(seen.pos.shape[:2], dtype=bool), seen.pos.copy()
+    flags[:5], hidden[:5] = False, 0.0
+    answer = identify(Drag(), Observations(replace(seen, pos=hidden), flags), per_body=True, bounds=BOUNDS)
+    assert [value.name for value in answer.values] == ["sand.friction_angle#1", "sand.friction_angle#2"]
+
+
+def test_open_scenes_are_refused() -> None:
+    seen = thrown()
+    with pytest.raises(ObservationError, match="nodes enter or leave the scene"):
+        Observations.of(replace(seen, alive=np.ones(seen.pos.shape[:2], dtype=bool)))
+
+
+@pytest.mark.parametrize("down", [(0.0, -9.81), (4.905, -8.496)])
+@pytest.mark.parametrize("tilt", [-30.0, 10.0, 45.0])
+def test_the_tilt_of_gravity_is_an_angle(down: tuple[float, float], tilt: float) -> None:
+    seen = thrown()
+    seen = replace(seen, metadata=replace(seen.metadata, gravity=down))
+    (unknown,) = unknowns_of(seen, ["gravity"], {}).items
+    z = (tilt - unknown.low) / (unknown.high - unknown.low)
+    found = Unknowns((unknown,)).applied(seen.state(0), np.array([z])).gravity
+    assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(down))
+    turn = math.degrees(math.atan2(down[0] * found[1] - down[1] * found[0], np.dot(down, found)))
+    assert turn == pytest.approx(tilt, abs=1e-6)  # counter-clockwise is towards +x
+
+
+def test_a_search_that_was_cut_short_says_so() -> None:
+    few = SearchSettings(num_scanned=3, max_evaluations=2)
+    answer = identify(Drag(), thrown(), bounds=BOUNDS, search_settings=few)
+    assert answer.is_unfinished and "stopped at search.max_evaluations" in str(answer)
+    assert not identify(Drag(), thrown(), bounds=BOUNDS).is_unfinished
 
 
 def test_an_answer_at_a_bound_says_so() -> None:
@@ -438,6 +508,10 @@ def test_intervals_do_not_depend_on_the_truth_of_their_own_part() -> None:
 def test_answers_are_read_as_they_were_written(tmp_path: Path) -> None:
     answer: Answer = identify(Drag(), thrown(), bounds=BOUNDS, scene="first")
     answer.write(tmp_path)
+    assert read_answers(tmp_path, "solver") == [answer]
+    older = sealed.read(path := tmp_path / "scenes" / "first_solver.json", "")
+    del older["is_unfinished"]
+    sealed.write(path, older)
     assert read_answers(tmp_path, "solver") == [answer]
     known = known_of([answer, answer])["sand.friction_angle"]
     assert [own.truth for own in known] == [ANGLE, ANGLE]
