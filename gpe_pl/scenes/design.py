@@ -143,7 +143,7 @@ def design(
     start = simulator.standing(state, metadata)
     guidance = Guidance(simulator, start, movable, limits, goal, num_frames, failed=(4 * metadata.longest_side) ** 2)
     before, began = guidance.misfit(np.full(len(guidance.unknowns), 0.5)), time.process_time()
-    found = search(guidance, SearchSettings(method=method, num_scanned=3, max_evaluations=evaluations))
+    found = search(guidance, SearchSettings(method=method, num_scanned=3, max_evaluations=evaluations, profile_evaluations=0))
     if not found.misfit < math.log(guidance.failed):
         raise DesignFault(
             f"every rollout failed, with all {len(found.tried)} poses that were tried; check the scene, and shorten seconds={seconds}"

@@ -8,6 +8,7 @@ where it was.
 from __future__ import annotations
 
 import logging
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -159,6 +160,7 @@ def _stored(name: EngineName, pairs: Sequence[Pair], settings: Settings, folder:
         )
         report = save_dataset(folder / "data", dataset, train=train, val=val, test=test)
         if report.refusals:
+            shutil.rmtree(folder / "data" / dataset)  # a later run would take it for complete
             raise AdaptationError(f"{SCENES[name].label}: {len(report.refusals)} scenes cannot be used: {report.refusals[0]}")
     return dataset
 

@@ -1,7 +1,8 @@
 """How much worse other values of one unknown fit than the answer.
 
 The search has tried many values. The lower convex hull of their misfits over one unknown is a curve that needs no further rollouts. With several unknowns, a
-value was tried together with different values of the others. The hull then approximates the smallest misfit over these, as in a profile likelihood.
+value was tried together with different values of the others. The hull then approximates the smallest misfit over these, as in a profile likelihood, if the
+search has followed the valleys of the misfit (``valleys``).
 """
 
 from __future__ import annotations

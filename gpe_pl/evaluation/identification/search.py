@@ -19,6 +19,7 @@ from pydantic.dataclasses import dataclass as validated_dataclass
 from scipy.optimize import minimize, minimize_scalar
 
 from gpe_pl.evaluation.identification.gradient_check import GradientCheck, Objective, gradient_check
+from gpe_pl.evaluation.identification.valleys import follow_valleys
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.system.progress import Progress
 
@@ -28,7 +29,7 @@ TOLERANCE = 2e-3
 LARGEST = 50.0
 """Largest exponent of the misfit above that of the start."""
 ALL_AT_ONCE = 4
-"""From this number of unknowns on, the search starts in the middle, without a scan."""
+"""From this number of unknowns on, the search starts in the middle, without a scan, and follows no valleys."""
 
 
 @validated_dataclass(frozen=True, config={"extra": "forbid"})
@@ -40,11 +41,14 @@ class SearchSettings:
             finite differences trusts them. ``gradient`` is checked too, and falls back in the same way.
         num_scanned: number of values at which each unknown is scanned.
         max_evaluations: largest number of further rollouts of all windows.
+        profile_evaluations: with two or three unknowns, largest number of rollouts of all windows for each value of one at which the others are searched again
+            (see ``valleys``); 0 leaves this out, and intervals can be too narrow.
     """
 
     method: Literal["auto", "gradient", "derivative_free"] = "auto"
     num_scanned: Annotated[int, Field(ge=3)] = 9
     max_evaluations: Annotated[int, Field(ge=1)] = 60
+    profile_evaluations: Annotated[int, Field(ge=0)] = 12
 
 
 @dataclass
@@ -111,6 +115,8 @@ def search(objective: Objective, settings: SearchSettings | None = None, on_prog
         options = {"initial_tr_radius": width, "final_tr_radius": TOLERANCE, "maxfev": s.max_evaluations}
         result = minimize(relative, start, method="COBYQA", bounds=[(0.0, 1.0)] * number, options=options)
     is_unfinished = not result.success and len(tried) - num_scanned >= s.max_evaluations
+    if s.profile_evaluations and 1 < number < ALL_AT_ONCE:
+        follow_valleys(misfit, tried, s.profile_evaluations)
     z, least = min(tried, key=lambda pair: pair[1])
     return Found(np.clip(z, 0.0, 1.0), least, method, check, tried, is_unfinished)
 

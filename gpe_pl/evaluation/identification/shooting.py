@@ -22,7 +22,7 @@ from gpe_pl.evaluation.identification.observations import Observations
 from gpe_pl.evaluation.identification.unknowns import Unknowns
 from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.rollout.loop import Restartable, Simulator
+from gpe_pl.rollout.loop import Restartable, Simulator, unfit
 from gpe_pl.trajectory.state import State
 
 FLOOR = 1e-6
@@ -144,9 +144,12 @@ def shooting(simulator: Simulator, observations: Observations, unknowns: Unknown
     """Return the rollouts of a scene. A learned simulator does not clamp parameters: optimisers keep bounds, and gradients would vanish beyond them.
 
     Raises:
-        ShootingError: the motion is too short, or it begins after the start of the scene and the solver cannot be restarted.
+        ShootingError: the solver has other frames or materials than the motion, the motion is too short, or it begins after the start of the scene and the
+            solver cannot be restarted.
         SceneError: the scene does not fit the model.
     """
+    if (stop := unfit(simulator, observations.trajectory.metadata)) is not None:
+        raise ShootingError(stop.message)
     s = settings or ShootingSettings()
     is_learned, completed = isinstance(simulator, LearnedSimulator), observations.completed
     first = observations.first_frame

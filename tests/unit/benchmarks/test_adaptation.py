@@ -97,6 +97,21 @@ def test_velocities_and_stress_of_an_engine_are_stored_with_its_scenes(
             assert (trajectory.vel == 3.0).all()
 
 
+def test_scenes_that_cannot_be_used_leave_no_data_set(
+    tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A later run would take it for complete."""
+    run, _ = engine_that_slides(0.1)
+    with_engine(monkeypatch, "calculix", run)
+    pairs = [scenes.pair("calculix", candidates["calculix"], seed, tmp_path) for seed in (1, 2, 3, 0)]
+    broken = replace(pairs[0].engine, pos=pairs[0].engine.pos * np.nan)
+    chosen = suite.Settings({}, {"calculix": suite.OfEngine("fem", [])}, 1, 1, 2)  # type: ignore[arg-type]
+    for _ in range(2):
+        with pytest.raises(suite.AdaptationError, match="1 scenes cannot be used"):
+            suite._stored("calculix", [replace(pairs[0], engine=broken), *pairs[1:]], chosen, tmp_path)
+    assert not list((tmp_path / "data").glob("calculix_*"))
+
+
 def settings(**changes: Any) -> suite.Settings:
     of_engine = {"kratos": suite.OfEngine("sand", ["model=gpe_tuned"])}
     return suite.Settings(cases={}, engines=of_engine, **{"num_train": 2, "num_val": 1, "num_test": 2, **changes})  # type: ignore[arg-type]

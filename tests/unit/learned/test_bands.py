@@ -168,7 +168,7 @@ def test_only_nodes_that_errors_are_about_are_covered(checkpoint: Path, kind: st
         return replace(own, truth=replace(truth, **about), predictions={LEARNED: replace(prediction, **about)})
 
     fractions = []
-    for k in range(12):
+    for k in range(6):
         calibration = Calibration("abc", True, 2)
         for seed in range(1000 * k, 1000 * k + 19):
             calibration.add(thinned(seed))

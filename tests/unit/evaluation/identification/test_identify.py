@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from gpe_pl.evaluation.identification.observations import ObservationError, Obse
 from gpe_pl.evaluation.identification.profile import Profile
 from gpe_pl.evaluation.identification.results import Task, write_table
 from gpe_pl.evaluation.identification.scene import SolverError, identify, solver_of
-from gpe_pl.evaluation.identification.search import SearchSettings
+from gpe_pl.evaluation.identification.search import SearchSettings, search
 from gpe_pl.evaluation.identification.shooting import Shooting, ShootingError, ShootingSettings, shooting
 from gpe_pl.evaluation.identification.unknowns import UnknownError, Unknowns, scene_bodies, unknowns_of
 from gpe_pl.evaluation.rollout_scores import rollout_scores
@@ -192,6 +192,44 @@ def test_a_search_that_was_cut_short_says_so() -> None:
     assert not identify(Drag(), thrown(), bounds=BOUNDS).is_unfinished
 
 
+@dataclass
+class Valley:
+    """A misfit that is nearly the same along a diagonal, where one unknown makes up for the other."""
+
+    number: int = 2
+    simulator: None = None
+
+    @property
+    def unknowns(self) -> range:
+        return range(self.number)
+
+    def misfit(self, z: np.ndarray) -> float:
+        along, across = z[0] - 0.55, z[0] + z[1] - 1.0
+        rest = float(((z[2:] - 0.4) ** 2).sum())
+        return math.log(1e-4 * (1 + 0.3 * along**2) + 0.5 * across**2 + 0.1 * rest)
+
+    def misfit_and_gradient(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        raise AssertionError
+
+
+@pytest.mark.parametrize("number", [2, 3])
+def test_intervals_follow_valleys_of_the_misfit(number: int) -> None:
+    """The smallest misfit over the other unknown rises by less than 0.1 over the whole range."""
+
+    def interval(evaluations: int, k: int) -> tuple[float, float]:
+        found = search(Valley(number), SearchSettings(profile_evaluations=evaluations))
+        return Profile.of(((float(z[k]), misfit) for z, misfit in found.tried), (0.0, 1.0)).within(0.2)
+
+    for k in (0, 1):
+        low, high = interval(12, k)
+        assert low < 0.05 and high > 0.95
+        low, high = interval(0, k)
+        assert high - low < 0.2
+    if number == 3:  # the third is well known
+        low, high = interval(12, 2)
+        assert 0.3 < low < 0.4 < high < 0.5
+
+
 def test_an_answer_at_a_bound_says_so() -> None:
     answer = identify(Drag(), thrown(45.0), bounds=BOUNDS)
     assert answer.values[0].at_bound == "upper"
@@ -265,6 +303,23 @@ def test_an_answer_that_does_not_fit_says_so() -> None:
     assert "solver does not fit: its rollouts are" in str(answer)
     assert any("solver does not fit" in line for line in side_by_side({"solver": answer}))
     assert not identify(Drag(), seen, bounds=BOUNDS).warning
+
+
+@dataclass(frozen=True)
+class Recorded(Drag):
+    """A solver, which knows its frames."""
+
+    name: ClassVar[str] = "drag"
+    version: ClassVar[str] = "1"
+    frame_dt: float = DT
+    materials: tuple[str, ...] = ("sand",)
+
+
+def test_a_solver_with_other_frames_than_the_motion_is_refused() -> None:
+    seen = thrown()
+    assert identify(Recorded(), seen, bounds=BOUNDS)["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=0.1)
+    with pytest.raises(ShootingError, match=r"the solver drag has frame_dt = 0.01 s, the scene 0.02 s"):
+        identify(Recorded(), seen.every(2), bounds=BOUNDS)
 
 
 def test_refusals() -> None:
