@@ -104,11 +104,11 @@ def test_scenes_that_cannot_be_used_leave_no_data_set(
     run, _ = engine_that_slides(0.1)
     with_engine(monkeypatch, "calculix", run)
     pairs = [scenes.pair("calculix", candidates["calculix"], seed, tmp_path) for seed in (1, 2, 3, 0)]
-    broken = replace(pairs[0].engine, pos=pairs[0].engine.pos * np.nan)
+    broken = replace(pairs[-1].engine, pos=pairs[-1].engine.pos * np.nan)
     chosen = suite.Settings({}, {"calculix": suite.OfEngine("fem", [])}, 1, 1, 2)  # type: ignore[arg-type]
     for _ in range(2):
         with pytest.raises(suite.AdaptationError, match="1 scenes cannot be used"):
-            suite._stored("calculix", [replace(pairs[0], engine=broken), *pairs[1:]], chosen, tmp_path)
+            suite._stored("calculix", [*pairs[:-1], replace(pairs[-1], engine=broken)], chosen, tmp_path)
     assert not list((tmp_path / "data").glob("calculix_*"))
 
 

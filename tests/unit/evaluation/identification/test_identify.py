@@ -20,9 +20,9 @@ from gpe_pl.evaluation.identification.observations import ObservationError, Obse
 from gpe_pl.evaluation.identification.profile import Profile
 from gpe_pl.evaluation.identification.results import Task, write_table
 from gpe_pl.evaluation.identification.scene import SolverError, identify, solver_of
-from gpe_pl.evaluation.identification.search import SearchSettings, search
+from gpe_pl.evaluation.identification.search import SearchSettings
 from gpe_pl.evaluation.identification.shooting import Shooting, ShootingError, ShootingSettings, shooting
-from gpe_pl.evaluation.identification.unknowns import UnknownError, Unknowns, scene_bodies, unknowns_of
+from gpe_pl.evaluation.identification.unknowns import UnknownError, unknowns_of
 from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.files import sealed
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -32,38 +32,8 @@ from gpe_pl.rollout.loop import SimulationError, rollout
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests import scenes
+from tests.drag import ANGLE, BOUNDS, DT, Drag, thrown
 from tests.unit.training.test_unroll_gradients import Double, simulator_of, slow, unroll
-
-DT, ANGLE = 0.01, 31.0
-BOUNDS = {"sand.friction_angle": (20.0, 42.5), "fluid.kinematic_viscosity": (1e-3, 1.0)}
-
-
-@dataclass(frozen=True)
-class Drag:
-    """A simulator in which the first material parameter slows nodes down: v' = g - rate · parameter · v. It can start anywhere."""
-
-    rate: float = 0.1
-    can_restart: bool = True
-
-    def restarted(self, state: State) -> State:
-        return state
-
-    def step(self, state: State) -> State:
-        column = np.nan_to_num(np.asarray(state.material_params, dtype=np.float64)).sum(axis=1, keepdims=True)
-        vel = (state.vel + DT * np.asarray(state.gravity)) / (1 + DT * self.rate * column)
-        return state.later(DT, state.pos + DT * vel, vel)
-
-
-def thrown(values: float | np.ndarray = ANGLE, material: str = "sand", simulator: Drag | None = None, num_frames: int = 40) -> Trajectory:
-    """Return two bodies that fly under gravity and drag."""
-    grid = np.stack(np.meshgrid(np.arange(3), np.arange(3), indexing="ij"), axis=-1).reshape(-1, 2) * 0.1
-    pos = np.concatenate([grid, grid + np.array([1.0, 0.0])])
-    name = {"sand": "friction_angle", "fluid": "kinematic_viscosity"}[material]
-    still = Trajectory.from_numpy(
-        np.repeat(pos[None], 3, axis=0), DT, material, {material: {name: np.broadcast_to(values, 18).copy()}},
-        vel=np.broadcast_to([1.0, 0.5], (3, 18, 2)).copy(), bounds=[(-5, 5), (-5, 5)], gravity=[0.0, -9.81], spacing=0.1,
-    )  # fmt: skip
-    return rollout(simulator or Drag(), still.state(0), num_frames - 1, still.metadata)
 
 
 def test_a_parameter_is_found_whatever_is_stored() -> None:
@@ -107,127 +77,11 @@ def test_motion_of_the_scene_is_found_too(wanted: list[str]) -> None:
     assert answer["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=2.0)
 
 
-@pytest.mark.parametrize("settings", [{"nodes": 0.3}, {"every": 3}, {"added_noise": 3e-4}])
-def test_parts_of_the_motion_are_enough(settings: dict[str, float]) -> None:
-    observed = Observations.of(thrown(), ObservationSettings(**settings))  # type: ignore[arg-type]
-    answer = identify(Drag(), observed, bounds=BOUNDS)
-    assert answer["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=3.0)
-    assert (answer.num_windows == 1) == ("nodes" in settings)
-
-
-def test_values_that_were_not_observed_are_not_used() -> None:
-    seen = thrown()
-    observed = Observations.of(seen, ObservationSettings(every=3))
-    wrong = np.where(observed.seen[..., None], seen.pos, np.float32(7.0))
-    assert np.abs(Observations(replace(seen, pos=wrong), observed.seen).completed.pos[:39] - seen.pos[:39]).max() < 1e-3
-
-
-def test_noise_is_smoothed_on_each_side_of_a_gap() -> None:
-    """A filter that took the frames beside a gap for neighbours would move them by decimetres."""
-    seen = thrown(num_frames=100)
-    flags = np.ones(seen.pos.shape[:2], dtype=bool)
-    flags[30:60] = False
-    found = Observations(seen, flags, noise=1e-4).completed
-    assert np.abs(found.pos - seen.pos).max() < 1e-3
-    whole = Observations(seen, np.ones_like(flags), noise=1e-4).completed
-    np.testing.assert_array_equal(found.pos[:25], whole.pos[:25])
-    starts = shooting(Drag(), Observations(seen, flags), unknowns_of(seen, None, BOUNDS)).starts
-    assert len(starts) > 2 and all(flags[frame].all() for frame in starts)
-
-
-def test_short_runs_of_frames_are_not_smoothed(caplog: pytest.LogCaptureFixture) -> None:
-    seen = thrown()
-    flags = np.ones(seen.pos.shape[:2], dtype=bool)
-    flags[8:12] = False
-    found = Observations(seen, flags, noise=1e-4).completed
-    np.testing.assert_array_equal(found.pos[:8], seen.pos[:8])
-    assert "fewer than 12 frames are observed in a row without a gap" in caplog.text
-
-
-def test_nodes_that_cross_a_seam_have_the_velocity_and_the_body_of_their_motion() -> None:
-    seen = thrown()
-    wrapped = replace(
-        seen, pos=(seen.pos + 2.9) % 3.0, metadata=replace(seen.metadata, bounds=((0.0, 3.0), (0.0, 3.0)), periodic=(True, True))
-    )
-    assert np.abs(np.diff(wrapped.pos, axis=0)).max() > 1.0
-    plain, across = (unknowns_of(own, ["velocity"], {}).items for own in (seen, wrapped))
-    assert [unknown.high for unknown in across] == pytest.approx([unknown.high for unknown in plain], rel=1e-3)
-    first = replace(seen, pos=seen.pos - seen.pos[:, 4:5])  # the first body lies across both seams
-    around = replace(wrapped, pos=first.pos % 3.0)
-    assert np.ptp(around.pos[0, :9]) > 1.0
-    assert sorted(map(len, scene_bodies(around))) == [9, 9]
-
-
-def test_bodies_are_those_of_the_first_observed_frame() -> None:
-    seen = thrown(np.repeat([24.0, 38.0], 9))
-    flags, hidden = np.ones(seen.pos.shape[:2], dtype=bool), seen.pos.copy()
-    flags[:5], hidden[:5] = False, 0.0
-    answer = identify(Drag(), Observations(replace(seen, pos=hidden), flags), per_body=True, bounds=BOUNDS)
-    assert [value.name for value in answer.values] == ["sand.friction_angle#1", "sand.friction_angle#2"]
-
-
-def test_open_scenes_are_refused() -> None:
-    seen = thrown()
-    with pytest.raises(ObservationError, match="nodes enter or leave the scene"):
-        Observations.of(replace(seen, alive=np.ones(seen.pos.shape[:2], dtype=bool)))
-
-
-@pytest.mark.parametrize("down", [(0.0, -9.81), (4.905, -8.496)])
-@pytest.mark.parametrize("tilt", [-30.0, 10.0, 45.0])
-def test_the_tilt_of_gravity_is_an_angle(down: tuple[float, float], tilt: float) -> None:
-    seen = thrown()
-    seen = replace(seen, metadata=replace(seen.metadata, gravity=down))
-    (unknown,) = unknowns_of(seen, ["gravity"], {}).items
-    z = (tilt - unknown.low) / (unknown.high - unknown.low)
-    found = Unknowns((unknown,)).applied(seen.state(0), np.array([z])).gravity
-    assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(down))
-    turn = math.degrees(math.atan2(down[0] * found[1] - down[1] * found[0], np.dot(down, found)))
-    assert turn == pytest.approx(tilt, abs=1e-6)  # counter-clockwise is towards +x
-
-
 def test_a_search_that_was_cut_short_says_so() -> None:
     few = SearchSettings(num_scanned=3, max_evaluations=2)
     answer = identify(Drag(), thrown(), bounds=BOUNDS, search_settings=few)
     assert answer.is_unfinished and "stopped at search.max_evaluations" in str(answer)
     assert not identify(Drag(), thrown(), bounds=BOUNDS).is_unfinished
-
-
-@dataclass
-class Valley:
-    """A misfit that is nearly the same along a diagonal, where one unknown makes up for the other."""
-
-    number: int = 2
-    simulator: None = None
-
-    @property
-    def unknowns(self) -> range:
-        return range(self.number)
-
-    def misfit(self, z: np.ndarray) -> float:
-        along, across = z[0] - 0.55, z[0] + z[1] - 1.0
-        rest = float(((z[2:] - 0.4) ** 2).sum())
-        return math.log(1e-4 * (1 + 0.3 * along**2) + 0.5 * across**2 + 0.1 * rest)
-
-    def misfit_and_gradient(self, z: np.ndarray) -> tuple[float, np.ndarray]:
-        raise AssertionError
-
-
-@pytest.mark.parametrize("number", [2, 3])
-def test_intervals_follow_valleys_of_the_misfit(number: int) -> None:
-    """The smallest misfit over the other unknown rises by less than 0.1 over the whole range."""
-
-    def interval(evaluations: int, k: int) -> tuple[float, float]:
-        found = search(Valley(number), SearchSettings(profile_evaluations=evaluations))
-        return Profile.of(((float(z[k]), misfit) for z, misfit in found.tried), (0.0, 1.0)).within(0.2)
-
-    for k in (0, 1):
-        low, high = interval(12, k)
-        assert low < 0.05 and high > 0.95
-        low, high = interval(0, k)
-        assert high - low < 0.2
-    if number == 3:  # the third is well known
-        low, high = interval(12, 2)
-        assert 0.3 < low < 0.4 < high < 0.5
 
 
 def test_an_answer_at_a_bound_says_so() -> None:
@@ -268,23 +122,6 @@ def test_unknowns_and_bounds_without_meaning_are_refused(
 def test_a_logarithmic_parameter_needs_positive_bounds() -> None:
     with pytest.raises(UnknownError, match=r"\[0, 0\.5\]: must be positive and finite"):
         identify(Drag(), thrown(0.03, "fluid"), bounds={"fluid.kinematic_viscosity": (0.0, 0.5)})
-
-
-def test_frames_before_the_first_observed_one_are_not_used() -> None:
-    seen = thrown()
-    flags = np.ones(seen.pos.shape[:2], dtype=bool)
-    flags[:12] = False
-    hidden = seen.pos.copy()
-    hidden[:12] = np.nan
-    answers = [identify(Drag(), Observations(replace(seen, pos=pos), flags), bounds=BOUNDS) for pos in (seen.pos, hidden)]
-    assert answers[0].values == answers[1].values
-    assert answers[0]["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=3.0), "velocities at the start follow from positions"
-
-
-def test_windows_without_an_observed_frame_are_refused() -> None:
-    with pytest.raises(ShootingError, match=r"no frame within shooting\.horizon=1 of the starts \[0\] is observed"):
-        settings = ShootingSettings(horizon=1, num_windows=1)
-        identify(Drag(), Observations.of(thrown(), ObservationSettings(every=4)), bounds=BOUNDS, shooting_settings=settings)
 
 
 def test_a_scene_in_which_every_rollout_fails_has_no_answer() -> None:
