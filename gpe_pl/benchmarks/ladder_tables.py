@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from gpe_pl.benchmarks.cost_and_error import (
+    FEWEST_SCENES,
     WINNING_HORIZONS,
     Comparison,
     Point,
@@ -42,7 +43,7 @@ def summary(cases: Mapping[str, Sequence[Point]]) -> str:
         nearest = min(learned, key=lambda p: _mean_ratio(p, solvers))
         own = [h for h in horizons if h in nearest.mse]
         slower = [nearest.cost / cost_at_error(solvers, nearest.error(h), h) if np.isfinite(nearest.error(h)) else math.inf for h in own]
-        cells = [_ratio(ratio_at_cost(nearest, solvers, h)) if h in own else "–" for h in horizons]
+        cells = [_ratio(ratio_at_cost(nearest, solvers, h), len(nearest.mse[h])) if h in own else "–" for h in horizons]
         lines.append(table_row([case, nearest.name, *cells, _times(slower), _verdict(nearest, solvers, own)]))
     note = (
         "Error: that of the nearest model over that of a solver of the same cost, with its 95 % interval over paired scenes. Time: that of the model over that "
@@ -133,11 +134,16 @@ def _ratios(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
     yield table_row(["", "against", *(f"@{h}" for h in horizons)])
     yield "|" + "---|" * (2 + len(horizons))
     for point in learned:
-        yield table_row([point.name, "solver of the same cost", *(_ratio(ratio_at_cost(point, solvers, h)) for h in horizons)])
+        yield table_row(
+            [point.name, "solver of the same cost", *(_ratio(ratio_at_cost(point, solvers, h), len(point.mse[h])) for h in horizons)]
+        )
         if hard != solvers:
-            yield table_row([point.name, "the same, moduli of the data", *(_ratio(ratio_at_cost(point, hard, h)) for h in horizons)])
+            yield table_row(
+                [point.name, "the same, moduli of the data", *(_ratio(ratio_at_cost(point, hard, h), len(point.mse[h])) for h in horizons)]
+            )
         for teacher in (p for p in solvers if p.name == point.teacher):
-            yield table_row([point.name, "solver of its labels", *(_ratio(paired_ratio(point.mse[h], teacher.mse[h])) for h in horizons)])
+            to_teacher = (_ratio(paired_ratio(point.mse[h], teacher.mse[h]), len(point.mse[h])) for h in horizons)
+            yield table_row([point.name, "solver of its labels", *to_teacher])
     winning = winners(points, horizons)
     rule = f"A model wins if the 95 % interval over paired scenes lies below 1 at equal time, at {WINNING_HORIZONS} horizons or more."
     yield from ("", f"{rule} {'**' + ', '.join(winning) + '** wins.' if winning else 'None does.'}")
@@ -151,6 +157,8 @@ def _ratios(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
 def _superiority(learned: Sequence[Point], solvers: Sequence[Point], horizons: Sequence[str]) -> str:
     """Return a sentence about emulator superiority: which models are closer to the reference than the solver that made their labels."""
     by_name = {p.name: p for p in solvers}
+    if min((len(point.mse[h]) for point in learned for h in horizons), default=FEWEST_SCENES) < FEWEST_SCENES:
+        return f"Emulator superiority (closer to the reference than the solver of its labels): fewer than {FEWEST_SCENES} scenes are too few to say."
     closer = []
     for point in (p for p in learned if p.teacher in by_name):
         below = [h for h in horizons if paired_ratio(point.mse[h], by_name[point.teacher].mse[h]).high < 1]
@@ -164,11 +172,12 @@ def of_own_moduli(solvers: Sequence[Point]) -> list[Point]:
     return [p for p in solvers if MODULI not in p.name]
 
 
-def _ratio(interval: Interval | None) -> str:
+def _ratio(interval: Interval | None, num_scenes: int) -> str:
+    """Return the table cell of a ratio over so many scenes; bold if it is below 1 and the scenes are enough to say so."""
     if interval is None:
         return "every solver costs more"
     text = f"{interval.estimate:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
-    return f"**{text}**" if interval.high < 1 else text
+    return f"**{text}**" if interval.high < 1 and num_scenes >= FEWEST_SCENES else text
 
 
 def _pays_off(seconds: float) -> str:

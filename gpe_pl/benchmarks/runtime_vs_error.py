@@ -126,7 +126,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
     also afterwards.
 
     Raises:
-        ComparisonError: no model was trained on a data set, or the solver has no reference solution.
+        ComparisonError: no model was trained on a data set, two models of a data set have one name, or the solver has no reference solution.
         GenerationError: a reference solution ended early.
     """
     torch.set_num_threads(settings.num_threads)
@@ -139,6 +139,11 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
                 f"{' and '.join([*settings.runs, *settings.checkpoints])}: no finished run that was trained on the data set {spec.name!r} of size "
                 f"{spec.size!r}; train with `python -m gpe_pl.fit experiment=table1 size={spec.size}`, or set suite.runs or suite.checkpoints"
             )
+    unfit = [
+        c for c in settings.checkpoints if not any(label.endswith(f", {checkpoint_label(c)}") for own in entrants.values() for label in own)
+    ]
+    if unfit:
+        log.warning("%s: not compared, trained on none of the data sets of the suite (suite.cases, size)", ", ".join(unfit))
     results: dict[str, Comparison] = {}
     for name, spec in specs.items():
         log.info("%s: %d models", name, len(entrants[name]))
@@ -146,7 +151,10 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
         records += [{**record, "seed": spec.seed} for record in _records(name, found.points, found.order)]
     FinishedParts(folder / PARTS).clear()
     sections = [section(name, found, settings.num_trajectories) for name, found in results.items()]
-    return records, "\n\n".join([summary({name: found.points for name, found in results.items()}), *sections])
+    left_out = (
+        [f"Checkpoints that were not compared, because they were trained on none of these data sets: {', '.join(unfit)}."] if unfit else []
+    )
+    return records, "\n\n".join([summary({name: found.points for name, found in results.items()}), *sections, *left_out])
 
 
 def _entrants(finished: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[str, Entrant]:
@@ -161,6 +169,10 @@ def _entrants(finished: Sequence[Run], spec: DatasetSpec, settings: Settings) ->
         fine = int(json.loads(metadata.config).get("fine", 1))
         if has_scenes_of(spec, metadata.dataset, fine) and metadata.spacing == spec.scene.spacing:
             label = f"{model_label(simulator)}, {checkpoint_label(checkpoint)}"
+            if label in found:
+                raise ComparisonError(
+                    f"two models of {spec.name} are called {label}; copy one of the checkpoints to a file of another name"
+                )
             found[label] = Entrant(simulator, Spent(math.nan), _teacher(Labels(fine), spec))
     for label, entrant in list(found.items()):
         simulator = entrant.simulator.to(settings.device)

@@ -37,7 +37,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.least_distance import distance_in
 from gpe_pl.learned.pretrained import fingerprint
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.learned.transfer import check_model
+from gpe_pl.learned.transfer import check_model, keep_rollout_settings
 from gpe_pl.models.lookup import model_class
 from gpe_pl.reports.finished_runs import Run, rollout_errors, table_of
 from gpe_pl.rollout.loop import Restartable
@@ -164,7 +164,10 @@ class FitRun:
         if self.training.num_steps == 0:
             best = self.folder / "checkpoints" / "best.ckpt"
             best.parent.mkdir(parents=True, exist_ok=True)
-            self._new_module(self.training).simulator.save(best)
+            simulator = self._new_module(self.training).simulator
+            if self.start is not None:
+                keep_rollout_settings(simulator, self.start)
+            simulator.save(best)
             return best
         module, is_trained = self._new_module(self.training), self.start is not None
         best = train(module, self._data, self.training, self.trainer, self._loggers, self.folder, self.callbacks, is_trained)

@@ -14,12 +14,18 @@ from gpe_pl.files.run_folder import LOOKUPS
 OF_SWEEPS = "size.comparison.seeds"
 """Key that is read at the start of a sweep, not in its runs."""
 
-UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
+Condition = tuple[str, Callable[[Any], bool]]
+
+UNREAD: dict[str, Condition | tuple[Condition, ...]] = {
     "training.num_steps": ("training.budget_minutes", lambda minutes: minutes is not None),
     "training.batch_size": ("batching.max_nodes", lambda nodes: nodes is not None),
     "training.warmup_steps": ("training.schedule", lambda schedule: schedule != "cosine"),
     "training.push_steps": ("training.push_fraction", lambda fraction: fraction == 0),
-    "training.push_correction": ("training.push_fraction", lambda fraction: fraction == 0),
+    "training.push_correction": (
+        ("training.push_fraction", lambda fraction: fraction == 0),
+        ("training.targets", lambda targets: targets == "solver"),
+    ),
+    "training.noise_correction": ("training.targets", lambda targets: targets == "solver"),
     "training.stress_loss": ("model.stress", lambda stress: stress is False),
     "training.stress_weight": ("model.stress", lambda stress: stress is False),
     "model.stress_unit": ("model.stress", lambda stress: stress is False),
@@ -32,8 +38,8 @@ UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "graph.num_levels": ("graph.mesh", lambda mesh: not mesh),
     "dimension": ("data.size", lambda size: size == "imported"),
 }
-"""Keys that are unused for some values of another key, with that key and the test of its value. They are also unused where that key is. The value 0 is always
-allowed, because it switches the setting off."""
+"""Keys that are unused for some values of other keys, with each of these keys and the test of its value. They are also unused where such a key is. The value 0
+is always allowed, because it switches the setting off."""
 
 
 def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
@@ -47,12 +53,19 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
         key, _, value = override.lstrip("+").partition("=")
         if _is_in_lookup(key) and not key.startswith(OF_SWEEPS) and not _is_read(cfg, key):
             return f"{key}={value}: has no effect, because no other setting takes its value here; leave it out"
-        reader = key
-        while value != "0" and reader in UNREAD:
-            reader, is_unread = UNREAD[reader]
+        readers = [] if value == "0" else _conditions(key)
+        while readers:
+            reader, is_unread = readers.pop()
             if is_unread(decides := OmegaConf.select(cfg, reader)):
                 return f"{key}={value}: has no effect with {reader}={'null' if decides is None else decides}; leave out one of the two"
+            readers += _conditions(reader)
     return ""
+
+
+def _conditions(key: str) -> list[Condition]:
+    """Return the conditions under which a key is unused."""
+    own: Any = UNREAD.get(key, ())
+    return list(own) if not own or isinstance(own[0], tuple) else [own]
 
 
 def _is_in_lookup(key: str) -> bool:

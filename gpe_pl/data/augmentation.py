@@ -12,11 +12,13 @@ All of them are exact: the image of a window, with its walls, is a window that t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gpe_pl.errors import GpeError
+from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.boundary import BoundaryMotion
 from gpe_pl.trajectory.reflection import Reflection, Rotation, level_axes
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -26,6 +28,10 @@ MIRROR_STREAM, TURN_STREAM, BOOST_STREAM, QUARTER_STREAM = 1, 2, 3, 4
 
 NUM_TURNS = {2: 4, 3: 24}
 """Number of rotations that map axes onto axes, by dimension."""
+
+
+ONE_SIDED = 0.7
+"""Accelerations whose mean is larger than this fraction of their root mean square come from a pull that acts on all nodes."""
 
 
 class AugmentationError(GpeError, ValueError):
@@ -74,6 +80,21 @@ class Augmentation:
             raise AugmentationError(
                 "training.rotate, quarter_turns and boost_speed: not in periodic domains, which stay as they are; leave them off"
             )
+
+    def hidden_pull(self, beginnings: Iterable[Trajectory]) -> list[int]:
+        """Return the axes that images turn over although nodes accelerate along them, as where data store no gravity but have some.
+
+        Args:
+            beginnings: first frames of trajectories, which are read if images turn something over.
+        """
+        found: dict[int, list[np.ndarray]] = {}
+        for trajectory in beginnings if self.mirror or self.rotate else ():
+            if any(trajectory.metadata.gravity) or trajectory.num_frames < 3:
+                continue
+            vel = integrators.velocities(trajectory.pos.astype(np.float64), trajectory.metadata.frame_dt, trajectory.metadata.periodicity)
+            for axis in _level(trajectory):
+                found.setdefault(axis, []).append(np.diff(vel, axis=0)[..., axis].ravel())
+        return [axis for axis, own in found.items() if _is_one_sided(np.concatenate(own))]
 
     def reflection(self, trajectory: Trajectory, seed: int, sample: int) -> Reflection:
         """Return the reflection of a sample."""
@@ -127,6 +148,11 @@ def turned_with_gravity(trajectory: Trajectory, number: int) -> Trajectory:
         ),
         prescribed=None if trajectory.prescribed is None else np.ascontiguousarray(trajectory.prescribed[:, source]),
     )
+
+
+def _is_one_sided(values: np.ndarray) -> bool:
+    """Whether values have nearly one sign and size: their mean is larger than ``ONE_SIDED`` times their root mean square."""
+    return bool(abs(values.mean()) > ONE_SIDED * np.sqrt(np.square(values).mean()))
 
 
 def _level(trajectory: Trajectory) -> list[int]:

@@ -35,6 +35,9 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
+LOOKED_AT = 20
+"""Number of trajectories, and of their first frames, in which a pull is looked for that data do not store as gravity."""
+
 
 class StartKey(NamedTuple):
     """Key of a push-forward sample. Successive batches of a lane continue the same unrolls, until the lane takes other windows.
@@ -372,6 +375,13 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         if augmentation.is_beyond_mirror:
             for stored in trajectories:
                 augmentation.check(stored.window(0, 1))
+        if pulled := augmentation.hidden_pull(stored.window(0, LOOKED_AT) for stored in trajectories[:LOOKED_AT]):
+            axes = " and ".join("xyz"[axis] for axis in pulled)
+            log.warning(
+                "training.mirror, training.rotate: no gravity is stored, but nodes accelerate along %s, which images turn over; store gravity "
+                "(gravity=[…] of convert), or leave these settings off",
+                axes,
+            )
         self.is_open = any(trajectory.is_open for trajectory in trajectories)
         if self.is_open:
             check_settings(unroll_steps, solver is not None, augmentation != Augmentation())
@@ -471,7 +481,7 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             trajectory.boundary.at(history),
             gravity,
             past,
-            frame * dt,
+            (stored.phase / stored.stride + frame) * dt,
             trajectory.rest_pos,
             trajectory.cells,
             cell_dim=trajectory.cell_dim,

@@ -91,6 +91,15 @@ def start_from(new: LearnedSimulator, trained: LearnedSimulator) -> Transfer:
     return transfer
 
 
+def keep_rollout_settings(new: LearnedSimulator, trained: LearnedSimulator) -> None:
+    """Give a simulator that is not trained the settings of rollouts that the trained one has: static friction where its graphs allow it, the mean over mirror
+    images, and the least distance in spacings.
+    """
+    new.static_friction = trained.static_friction if new.builder.spec.islands else 0.0
+    new.mirror_average = trained.mirror_average
+    new.least_distance = trained.least_distance * new.builder.metadata.spacing / trained.builder.metadata.spacing
+
+
 def source_materials(materials: Sequence[str], trained: Sequence[str]) -> dict[str, str]:
     """Return for each material the trained one whose weights it takes: itself, else the first of its kind (with a mesh or without), else the first."""
     chosen = {}

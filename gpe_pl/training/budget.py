@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,6 +22,7 @@ import torch
 from filelock import FileLock
 from pydantic import Field, TypeAdapter, ValidationError
 
+from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.dataset import WindowDataset, collated
 from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
@@ -68,6 +69,11 @@ def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: T
         parts["cuda_graph"] = training.cuda_graph
     if training.unroll_steps is not None:
         parts["unroll_steps"] = training.unroll_steps
+    if training.targets != "trajectory":  # the solver runs for states that deviate
+        parts["targets"] = [training.targets, training.noise.is_any]
+    if training.augmentation != Augmentation():
+        parts["augmentation"] = asdict(training.augmentation)
+    parts |= {name: value for name in ("early_layers", "neighbor_weight") if (value := getattr(training, name)) is not None}
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:8]
     return f"{config['data']['name']} {config['size']['name']} {config['model']['_target_'].rpartition('.')[2]} {digest}"
 

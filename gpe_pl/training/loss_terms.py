@@ -6,8 +6,8 @@ mean of exp(−n/40) |error|^0.5, where n is the number of neighbours, and 40 is
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Literal
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int64
@@ -40,6 +40,12 @@ def penalty(error: Float[Tensor, "node dim"], loss: Loss, least: Float[Tensor, "
     if loss == "root":
         return (error.square().sum(dim=1, keepdim=True) + least.square()) ** 0.25
     return SMALL_ERROR**2 * (error / SMALL_ERROR).square().log1p() if loss == "log" else error.square()
+
+
+def without_held(store: Mapping[str, Any], error: Float[Tensor, "node dim"]) -> Float[Tensor, "node dim"]:
+    """Return errors with zeros along the axes along which the motion of a node is given, so that no penalty of a whole vector counts them."""
+    held = store.get("prescribed")
+    return error if held is None else error.masked_fill(held, 0.0)
 
 
 def stress_error(

@@ -27,7 +27,7 @@ from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.system import ranks
 from gpe_pl.system.machine import has_cpp_compiler
 from gpe_pl.training.cuda_graph import CudaGraphs
-from gpe_pl.training.loss_terms import LEAST_ERROR, Loss, StressLoss, num_neighbors, penalty, stress_error
+from gpe_pl.training.loss_terms import LEAST_ERROR, Loss, StressLoss, num_neighbors, penalty, stress_error, without_held
 from gpe_pl.training.optimizer import OnePassAdam, clip
 from gpe_pl.training.push_forward import Excursions
 from gpe_pl.training.unroll_gradients import predictions
@@ -234,7 +234,9 @@ class TrainingModule(L.LightningModule):
     def _loss_of(self, batch: HeteroData, predicted: Prediction) -> Tensor:
         """Return the loss of the predictions for a batch of training graphs."""
         std = self.simulator.stress_std.to(self.simulator.builder.precision)
-        acceleration = [self._penalty(a - self._normalized(batch[m].target)) for m, a in predicted.acceleration.items()]
+        acceleration = [
+            self._penalty(without_held(batch[m], a - self._normalized(batch[m].target))) for m, a in predicted.acceleration.items()
+        ]
         stress = [self._stress_error(batch, m, s, batch[m].stress_target / std) for m, s in predicted.stress.items()]
         stores = [batch[m] for m in predicted.acceleration]
         if self.neighbor_weight is not None:

@@ -101,7 +101,7 @@ class TrainingSettings:
     val_interval: Annotated[int, Field(ge=1)] = 1000
     num_val_rollouts: Annotated[int, Field(ge=1)] = 4
     val_rollout_steps: Annotated[int, Field(ge=1)] = 100
-    least_distance: Annotated[float, Field(ge=0, le=1)] | None = None
+    least_distance: Annotated[float, Field(gt=0, le=1)] | None = None
     val_containment: bool = True
 
     def __post_init__(self) -> None:

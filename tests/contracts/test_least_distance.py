@@ -133,3 +133,12 @@ def test_checkpoints_store_it_and_programs_refuse_it(simulator: LearnedSimulator
     for value in (True, "0.1", float("nan"), float("inf")):
         with pytest.raises(LeastDistanceError):
             checked(value)
+
+
+def test_models_of_several_scales_keep_it_in_spacings() -> None:
+    builder = scenes.builder(("fluid",), scales="dimensionless")
+    own = LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder).eval()
+    own.least_distance = 0.01
+    spacing = builder.metadata.spacing
+    assert own.at(2 * spacing).least_distance == pytest.approx(0.02)
+    assert own.at(2 * spacing).at(spacing).least_distance == pytest.approx(0.01) == own.least_distance

@@ -72,16 +72,18 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
     The results of each checkpoint are written to ``folder``, and beside the checkpoint unless it is a shipped model.
 
     Raises:
-        AcceptanceError: there are no acceptance scenes for a checkpoint, or two checkpoints have one name.
+        AcceptanceError: there are no acceptance scenes for a checkpoint, two checkpoints have one name, or one was replaced while the suite ran.
     """
     torch.set_num_threads(settings.num_threads)
     candidates = _candidates(settings.checkpoints, specs)
     parts, records = FinishedParts(folder / PARTS), list[dict[str, Any]]()
-    for candidate, path in candidates:
-        own = [record for scene in _scenes(candidate) for record in _measured(candidate, path, scene, folder, parts)]
+    for candidate, path, checksum in candidates:
+        own = [record for scene in _scenes(candidate) for record in _measured(candidate, checksum, scene, folder, parts)]
+        if verdicts.checksum(path) != checksum:
+            raise AcceptanceError(f"{path}: was replaced while the suite ran; start it again when no training writes there")
         records += own
         checks = [Check(**{key: r[key] for key in ("name", "passed", "measured", "solver", "limit")}) for r in own]
-        verdict = Verdict(verdicts.checksum(path), checks)
+        verdict = Verdict(checksum, checks)
         verdicts.write(folder / f"{candidate.name}{verdicts.suffix('acceptance')}", verdict)
         if path.parent != FOLDER:
             verdicts.write(verdicts.path_beside(path, "acceptance"), verdict)
@@ -89,10 +91,11 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
     return records, report(records)
 
 
-def _candidates(checkpoints: Sequence[str], specs: dict[str, DatasetSpec]) -> list[tuple[Candidate, Path]]:
-    """Return the models with the paths of their checkpoints, all loaded first, so that a wrong name is reported at once."""
-    found: dict[str, tuple[Candidate, Path]] = {}
+def _candidates(checkpoints: Sequence[str], specs: dict[str, DatasetSpec]) -> list[tuple[Candidate, Path, str]]:
+    """Return the models with the paths and checksums of their checkpoints, all loaded first, so that a wrong name is reported at once."""
+    found: dict[str, tuple[Candidate, Path, str]] = {}
     for checkpoint in checkpoints:
+        checksum = verdicts.checksum(checkpoint_path(checkpoint))
         simulator, name = of_stored_frames(checkpoint), checkpoint_label(checkpoint)
         own = simulator.builder.metadata
         fitting = [s for s in specs.values() if s.name == own.dataset and abs(s.scene.spacing / own.spacing - 1) < 0.01]
@@ -103,7 +106,7 @@ def _candidates(checkpoints: Sequence[str], specs: dict[str, DatasetSpec]) -> li
             )
         if name in found:
             raise AcceptanceError(f"two checkpoints are called {name}; copy one of them to a file of another name")
-        found[name] = Candidate(name, simulator, fitting[0]), checkpoint_path(checkpoint)
+        found[name] = Candidate(name, simulator, fitting[0]), checkpoint_path(checkpoint), checksum
     return list(found.values())
 
 
@@ -112,11 +115,11 @@ def _scenes(candidate: Candidate) -> list[str]:
     return [name for name, materials in SCENES.items() if material in materials]
 
 
-def _measured(candidate: Candidate, path: Path, scene: str, folder: Path, parts: FinishedParts) -> list[dict[str, Any]]:
+def _measured(candidate: Candidate, checksum: str, scene: str, folder: Path, parts: FinishedParts) -> list[dict[str, Any]]:
     """Return the records of a scene: those of a stopped suite, or new ones, whose figure is written first."""
     spec = candidate.spec
     (material,) = spec.scene.materials
-    identity = {"scene": scene, "model": candidate.name, "checkpoint": verdicts.checksum(path), "data": spec.as_dict()}
+    identity = {"scene": scene, "model": candidate.name, "checkpoint": checksum, "data": spec.as_dict()}
     if (stored := parts.get(identity)) is not None:
         return stored
     log.info("%s: %s", candidate.name, scene)

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from gpe_pl.benchmarks.acceptance.scenes import material_of, values_of
 from gpe_pl.benchmarks.half_steps import HalfSteps
 from gpe_pl.data.ground_truth import DatasetSpec
+from gpe_pl.errors import GpeError
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.verdicts import Check
 from gpe_pl.rollout.containment import Contained
@@ -33,6 +34,10 @@ MAX_CORRECTED = 0.01
 
 SMALLEST_CHANGE = 0.1
 """Smallest change of a quantity over the range of the parameter, as a fraction, that a person would see. Smaller changes are not compared."""
+
+
+class TrialError(GpeError, RuntimeError):
+    """Raised when the solver cannot finish a scene; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,7 @@ class Trial:
         truth: rollout of the solver.
         finer: rollout of the solver with half the time step (``HalfSteps``), whose difference from ``truth`` is the solver's own uncertainty.
         model: rollout of the model with containment.
-        corrected: fraction of particle-steps that containment corrected.
+        corrected: fraction of particle-steps that containment corrected; NaN for a model that stopped early.
     """
 
     value: float
@@ -106,15 +111,21 @@ def tried(candidate: Candidate, value: float, start: State, seconds: float) -> T
         value: material parameter of the scene, for the results.
         start: initial state.
         seconds: duration of the compared rollouts [s].
+
+    Raises:
+        TrialError: the solver stopped early, so there is nothing to compare with.
     """
     solver: Any = candidate.spec.solver
     history, metadata = candidate.simulator.builder.config.history, candidate.metadata()
     num_frames = max(2, round(seconds / solver.frame_dt))
     whole = rollout(solver, start, history + num_frames, metadata)
-    finer = rollout(HalfSteps(solver), start, history + num_frames, metadata).frames(history)
+    finer = rollout(HalfSteps(solver), start, history + num_frames, metadata)
+    for run, name in ((whole, "the solver"), (finer, "the solver with half its time step")):
+        if run.termination is not None:
+            raise TrialError(f"{candidate.spec.name}: {name} stopped early, so there is nothing to compare with: {run.termination.message}")
     truth = whole.frames(history)
     model, corrected = predicted(candidate, candidate.simulator.initial_state(whole, history), truth)
-    return Trial(value, truth, finer, model, corrected)
+    return Trial(value, truth, finer.frames(history), model, math.nan if model.termination is not None else corrected)
 
 
 def advanced(solver: Simulator, state: State, num_steps: int) -> State:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gpe_pl.benchmarks.learning_sets.sets import FULL, ONE_STEP, POSITION, RIGIDITY, SPACING, STRESS, VELOCITY, LearningSet
+from gpe_pl.benchmarks.learning_sets.sets import FULL, ONE_STEP, POSITION, RIGIDITY, SPACING, STOPPED, STRESS, VELOCITY, LearningSet
 from gpe_pl.evaluation.predictions import Predictor
 from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -55,6 +56,7 @@ def measured(checkpoint: Path, root: Path, learning_set: LearningSet, mirror_ave
             values = dict(errors(lasting(prediction, scene.truth.num_frames), scene.truth, learning_set.is_relative))
             if not learning_set.is_relative:
                 values[ONE_STEP] = one_step_error(simulator, name, scene.trajectory, learning_set.start)
+            values[STOPPED] = float(prediction.num_frames < scene.truth.num_frames)
             for quantity, value in values.items():
                 found.setdefault(name, {}).setdefault(quantity, []).append(value)
     return found
@@ -73,8 +75,9 @@ def errors(prediction: tuple[Trajectory, np.ndarray], truth: Trajectory, is_rela
         dt = truth.metadata.frame_dt
         yield POSITION, relative_error(pos[1:], truth.pos[1:])
         yield VELOCITY, relative_error(central_velocities(pos, dt), truth.vel[1:])
-        if rollout.stress is not None and truth.stress is not None and rollout.num_frames == truth.num_frames:
-            yield STRESS, relative_error(rollout.stress.node[1:], truth.stress.node[1:])
+        if rollout.stress is not None and truth.stress is not None:
+            is_whole = rollout.num_frames == truth.num_frames
+            yield STRESS, relative_error(rollout.stress.node[1:], truth.stress.node[1:]) if is_whole else math.inf
         return
     yield FULL, rms_distance(pos[1:], truth.pos[1:])
     fluid = liquid_nodes(truth)

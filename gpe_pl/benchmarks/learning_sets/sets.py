@@ -14,6 +14,8 @@ POSITION, VELOCITY, STRESS = "position, relative L2", "velocity, relative L2", "
 FULL, ONE_STEP = "full rollout, RMS distance [m]", "one step, RMS distance [m]"
 SPACING = "spacing of the settled liquid over the truth's"
 RIGIDITY = "change of distances in a body over its size"
+STOPPED = "stopped rollouts"
+"""Whether a rollout stopped early, 0 or 1. It has no row of its own."""
 QUANTITIES = (POSITION, VELOCITY, STRESS, FULL, ONE_STEP, SPACING, RIGIDITY)
 """Quantities in the order of the table."""
 

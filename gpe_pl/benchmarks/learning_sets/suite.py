@@ -21,7 +21,7 @@ import torch
 from pydantic import Field
 
 from gpe_pl.benchmarks.learning_sets.measures import MODEL, measured, pooled, trivial
-from gpe_pl.benchmarks.learning_sets.sets import QUANTITIES, RIGIDITY, SETS, LearningSet, SetName
+from gpe_pl.benchmarks.learning_sets.sets import QUANTITIES, RIGIDITY, SETS, STOPPED, LearningSet, SetName
 from gpe_pl.data.importers import ImportSettings, import_dataset
 from gpe_pl.data.importers.assemble import FOLDER
 from gpe_pl.data.importers.report import Report
@@ -190,7 +190,8 @@ def table(records: Sequence[Mapping[str, Any]]) -> list[str]:
 NOTE = (
     "Test trajectories are never trained on. RMS distances are pooled over frames, nodes, trajectories and splits. Relative L2 norms are means over frames. "
     "Intervals are 95 % bootstrap intervals over seeds and test trajectories. With one seed they do not contain the spread between seeds, and with three they "
-    "underestimate it. The trivial baseline is the best one. Core-minutes are training time."
+    "underestimate it. The trivial baseline is the best one. Core-minutes are training time. Where a rollout stopped early, nodes stay where they were, its "
+    "stress has an infinite error, and rigid bodies are measured in its last frame."
 )
 
 
@@ -218,13 +219,20 @@ def _rows(name: SetName, records: Sequence[Mapping[str, Any]]) -> list[str]:
                 "" if published is None else f"{published:.3g}",
                 "" if best is None else f"{best[1]:.3g} ({best[0].replace('_', ' ')})",
             ),
-            _estimate(quantity, np.array([[x for record in own for x in record["values"][MODEL][quantity]] for own in known])),
+            _estimate(quantity, np.array([[x for record in own for x in record["values"][MODEL][quantity]] for own in known]))
+            + _stopped([record["values"][MODEL] for own in known for record in own]),
             f"{len(splits)} of {len(learning_set.parts())}",
             ", ".join(map(str, seeds)),
             ", ".join(f"{value:g}" for value in minutes),
         ]
         lines.append(table_row(cells))
     return lines
+
+
+def _stopped(values: Sequence[Mapping[str, list[float]]]) -> str:
+    """Return how many rollouts of a model stopped early; empty if none did, or if an earlier version did not count them."""
+    flags = [flag for own in values for flag in own.get(STOPPED, [])]
+    return f", {sum(flags):.0f} of {len(flags)} stopped" if any(flags) else ""
 
 
 def _estimate(quantity: str, table: np.ndarray) -> str:

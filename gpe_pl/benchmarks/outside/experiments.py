@@ -240,8 +240,11 @@ def report(records: Sequence[Mapping[str, Any]]) -> list[str]:
         by_name = {curve.series: curve for curve in curves}
         for reference in [curve for curve in curves if curve.series not in ("solver", "model")]:
             values = [deviation(by_name[series], reference) for series in ("solver", "model")]
+            most = values[0][1]
             cells = ["not measured" if np.isnan(value) else f"{100 * value:.1f} %" for value, _ in values]
-            lines.append(table_row([experiment, model, reference.series, str(values[0][1]), *cells]))
+            if 0 < values[1][1] < most:
+                cells[1] += f" (of the {values[1][1]} points before it ended)"
+            lines.append(table_row([experiment, model, reference.series, str(most), *cells]))
     lines += [
         "",
         "Mean relative deviation from the points of the reference that the rollout reaches. The model's first frames are the solver's.",

@@ -7,7 +7,17 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, in_flight, inapplicable, no_boundary, shifted, stress_test
+from gpe_pl.benchmarks.stability.subject import (
+    Outcome,
+    Subject,
+    acceleration,
+    in_flight,
+    inapplicable,
+    largest,
+    no_boundary,
+    shifted,
+    stress_test,
+)
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.neighbors import radius_pairs
 from gpe_pl.learned.testing.changes import permuted
@@ -50,7 +60,9 @@ def isolated(subject: Subject) -> Outcome:
     none = permuted(state, torch.arange(0))
     values = [float(acceleration(simulator, s)[0].abs().max()) / subject.acceleration_std for s in (alone, one)]
     after = simulator.step(none)
-    return Outcome(max(values) < 1e-6 and after.num_nodes == 0, f"isolated {values[0]:.1e}, single {values[1]:.1e}; no particle: no crash")
+    return Outcome(
+        largest(values) < 1e-6 and after.num_nodes == 0, f"isolated {values[0]:.1e}, single {values[1]:.1e}; no particle: no crash"
+    )
 
 
 @stress_test(

@@ -104,6 +104,10 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
     records: list[dict[str, Any]] = []
     checkpoints = {name: _checkpoints(spec, settings) for name, spec in specs.items()}  # looked up once: runs may finish meanwhile
     untested = [name for name, models in checkpoints.items() if not models]
+    chosen = {path for models in checkpoints.values() for path, _ in models.values()}
+    unfit = [checkpoint for checkpoint in settings.checkpoints if checkpoint_path(checkpoint) not in chosen]
+    if unfit:
+        log.warning("%s: not tested, trained on none of the data sets of the suite (suite.cases, size)", ", ".join(unfit))
     tested = [(name, specs[name], models) for name, models in checkpoints.items() if models]
     if min(settings.num_workers, len(tested)) > 1:
         with ProcessPoolExecutor(settings.num_workers, multiprocessing.get_context("spawn"), _show_progress) as pool:
@@ -122,7 +126,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
         for label, (path, checksum) in models.items():
             _write_verdict(path, checksum, [r for r in records if (r["domain"], r["model"]) == (name, label)], folder)
     parts.clear()
-    return records, report(records, untested)
+    return records, report(records, untested, unfit)
 
 
 def _write_verdict(path: Path, checksum: str, records: Sequence[dict[str, Any]], folder: Path) -> None:
@@ -271,7 +275,7 @@ def failures(records: Sequence[dict[str, Any]]) -> list[str]:
 MARKS = {"passed": "passed", "failed": "**failed**", "not_applicable": "–"}
 
 
-def report(records: Sequence[dict[str, Any]], untested: Sequence[str] = ()) -> str:
+def report(records: Sequence[dict[str, Any]], untested: Sequence[str] = (), unfit: Sequence[str] = ()) -> str:
     """Return counts, also for each model, and a table per domain with a row per test and a column per model."""
     gating = [r for r in records if r["gating"]]
     lines = [
@@ -281,6 +285,8 @@ def report(records: Sequence[dict[str, Any]], untested: Sequence[str] = ()) -> s
     ]
     if untested:
         lines += ["", f"Not tested, for want of a model: {', '.join(untested)}."]
+    if unfit:
+        lines += ["", f"Checkpoints that were not tested, because they were trained on none of these data sets: {', '.join(unfit)}."]
     lines += ["", table_row(["domain", "model", "passed", "failed", "do not apply"]), "|" + "---|" * 5]
     for domain, model in dict.fromkeys((r["domain"], r["model"]) for r in records):
         counts = Counter(r["status"] for r in records if (r["domain"], r["model"]) == (domain, model))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 
 from gpe_pl.benchmarks.learning_sets import measures, suite
-from gpe_pl.benchmarks.learning_sets.sets import FULL, ONE_STEP, POSITION, RIGIDITY, SETS, SPACING, STRESS, VELOCITY, SetName
+from gpe_pl.benchmarks.learning_sets.sets import FULL, ONE_STEP, POSITION, RIGIDITY, SETS, SPACING, STOPPED, STRESS, VELOCITY, SetName
 from gpe_pl.data.importers.source import ImportFailure
 from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
@@ -83,6 +84,15 @@ def test_the_table_pools_splits_and_seeds_with_an_interval(tmp_path: Path) -> No
     assert f"- beam: put data/database_beam of github.com/quercushernandez/ThermodynamicsGNN into {tmp_path / 'database_beam'}" in text
 
 
+def test_rollouts_that_stopped_are_counted() -> None:
+    stopped = [json.loads(json.dumps(own)) for own in RECORDS]
+    for own in stopped:
+        own["values"]["model"][STOPPED] = [float(own["seed"] == 1)]
+    lines = suite.table(stopped)
+    assert any("| 2.6 [1, 4], 2 of 4 stopped |" in line for line in lines)
+    assert not any(STOPPED in line for line in lines)
+
+
 def test_splits_that_lack_a_seed_are_left_out_of_the_table() -> None:
     lines = suite.table([*RECORDS, record("without 2", 0, 100.0, 100.0)])
     assert any("| 9.19 (ballistic) | 2.6 [1, 4] | 2 of 5 |" in line for line in lines)
@@ -136,7 +146,7 @@ def test_every_split_is_trained_and_measured_once(
     assert [c["reuse"] for c in commands] == ["fluidfall_without_0", "fluidfall_without_1"]
     assert all(c["seed"] == "3" and c["graph.history"] == "2" and c["training.budget_minutes"] == "0.5" for c in commands)
     assert all(record["minutes"] == 0.5 for record in records)
-    assert records[0]["values"]["model"].keys() == {FULL, ONE_STEP, SPACING}
+    assert records[0]["values"]["model"].keys() == {FULL, ONE_STEP, SPACING, STOPPED}
     assert records[0]["values"]["constant_velocity"][ONE_STEP][0] < records[0]["values"]["constant_velocity"][FULL][0]
     assert "| 2 of 5 | 3 | 0.5 |" in text and "beam: put" in text
     assert {*averaged} == {bool(averages)}
@@ -239,8 +249,10 @@ def test_a_rollout_that_stopped_stays_where_it_was() -> None:
     np.testing.assert_array_equal(pos[1:], np.stack([whole.pos[1]] * 3))
 
 
-def test_relative_quantities_need_a_stress_in_every_frame() -> None:
+def test_relative_quantities_have_a_stress_if_both_have_one() -> None:
     truth = moving(stress=np.ones((4, 2, 4)))
     found = dict(measures.errors((truth, truth.pos), truth, True))
     assert found.keys() == {POSITION, VELOCITY, STRESS} and found[POSITION] == found[STRESS] == 0
-    assert dict(measures.errors((truth.frames(0, 2), truth.pos), truth, True)).keys() == {POSITION, VELOCITY}
+    stopped = dict(measures.errors((truth.frames(0, 2), truth.pos), truth, True))
+    assert stopped[STRESS] == float("inf"), "a mean over the rollouts that did not stop would be too good"
+    assert dict(measures.errors((moving(), truth.pos), truth, True)).keys() == {POSITION, VELOCITY}

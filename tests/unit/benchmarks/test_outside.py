@@ -4,13 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from gpe_pl.benchmarks.learning_sets.sets import FULL
 from gpe_pl.benchmarks.outside import engines, suite
-from gpe_pl.benchmarks.outside.experiments import DAM_BREAK_FILE, Curve, OutsideError, deviation, drop_radius, measured_fronts, run_out
+from gpe_pl.benchmarks.outside.experiments import (
+    DAM_BREAK_FILE,
+    Curve,
+    OutsideError,
+    deviation,
+    drop_radius,
+    measured_fronts,
+    report,
+    run_out,
+)
 
 
 def test_run_out_is_that_of_the_published_fit() -> None:
@@ -29,6 +39,17 @@ def test_deviations_count_only_points_that_the_run_reaches() -> None:
     assert value == pytest.approx(0.25) and count == 2
     value, count = deviation(own, Curve("law", np.array([3.0]), np.array([9.0])))
     assert np.isnan(value) and count == 0
+
+
+def test_a_model_that_ended_early_is_not_compared_with_all_points() -> None:
+    def curve(series: str, x: list[float]) -> dict[str, Any]:
+        return {"experiment": "droplet", "model": "fluid", "series": series, "x": x, "y": [1.0] * len(x)}
+
+    reference = curve("a law", [1.0, 2.0, 3.0])
+    lines = report([curve("solver", [0.0, 4.0]), curve("model", [0.0, 1.5]), reference])
+    assert any("| a law | 3 | 0.0 % | 0.0 % (of the 1 points before it ended) |" in line for line in lines)
+    lines = report([curve("solver", [0.0, 4.0]), curve("model", [0.0, 4.0]), reference])
+    assert any("| a law | 3 | 0.0 % | 0.0 % |" in line for line in lines)
 
 
 def test_fronts_are_read_by_series_and_in_order(tmp_path: Path) -> None:

@@ -359,6 +359,8 @@ def test_a_shipped_model_takes_part_in_the_case_of_its_data() -> None:
     assert label.endswith(", snow") and np.isnan(_entrants([], small, settings)[label].spent.training)
     assert list(_entrants([], dataset_spec(compose("simulate", "data=snow", "size=small", "data.fine=2")), settings)) == [label]
     assert not _entrants([], dataset_spec(compose("simulate", "data=snow", "size=tiny")), settings)
+    with pytest.raises(ComparisonError, match=r"two models of snow are called .*, snow; copy one of the checkpoints"):
+        _entrants([], small, Settings({}, [], repeats=[], checkpoints=["snow", "snow"]))
 
 
 def test_the_summary_names_the_nearest_model_and_what_it_lacks() -> None:
@@ -382,7 +384,7 @@ def test_the_summary_names_the_nearest_model_and_what_it_lacks() -> None:
 
 
 def test_emulator_superiority_is_against_the_solver_of_the_labels() -> None:
-    scenes = [1.0, 2.0, 3.0]
+    scenes = [1.0, 2.0, 3.0, 4.0, 5.0]
     data, teacher = (
         Point(name, "solver", [cost], {"full": [f * s for s in scenes]}) for name, cost, f in ((DATA, 4.0, 1.0), (NODES, 1.0, 4.0))
     )
@@ -394,6 +396,12 @@ def test_emulator_superiority_is_against_the_solver_of_the_labels() -> None:
     assert "solver of its labels): model (@full): the interval lies below 1." in text
     model.teacher = DATA
     assert "solver of its labels): no model is, at any horizon." in section("snow", Comparison([data, teacher, model], 1.0), 3)
+    for p in (data, teacher, model):
+        p.mse = {"full": p.mse["full"][:3]}
+    model.teacher = NODES
+    text = section("snow", Comparison([data, teacher, model], 1.0), 3)
+    assert "| model | solver of its labels | 0.50 [0.50, 0.50] |" in text
+    assert "solver of its labels): fewer than 5 scenes are too few to say." in text
 
 
 def test_a_scene_that_is_too_short_for_a_model_is_refused() -> None:

@@ -31,6 +31,8 @@ def unresolved(*overrides: str, hydra_config: bool = False) -> DictConfig:
         ("batching=by_nodes", "training.batch_size=4", "batching.max_nodes=20000"),
         ("recipe=paper", "training.warmup_steps=10", "training.schedule=exponential"),
         ("recipe=paper", "training.push_correction=0.2", "training.push_fraction=0.0"),
+        ("data=fem", "training.push_correction=0.7", "training.targets=solver"),
+        ("data=fem", "training.noise_correction=0.7", "training.targets=solver"),
         ("model=gns", "graph.num_levels=2", "graph.mesh=False"),
         ("model=gpe", "model.wall_damping=0.3", "model.wall_layer=0.0"),
         ("data=imported", "dimension=3", "data.size=imported"),
@@ -59,6 +61,7 @@ def test_what_only_unread_keys_read_is_refused() -> None:
         ("experiment=larger_scenes", "data.larger.solver.bounds=[[0,3],[0,1]]"),
         ("model=gpe", "training.num_steps=77"),
         ("model=gpe", "graph.num_levels=2"),
+        ("experiment=tuning_push", "training.push_correction=0.2"),
     ],
 )
 def test_what_is_read_is_not(beside: str, typed: str) -> None:

@@ -191,6 +191,25 @@ def test_without_gravity_and_with_walls_on_both_sides_or_none_all_axes_are_level
     assert images(beside_a_wall).any(axis=0).tolist() == [True, True, False]
 
 
+@pytest.mark.parametrize("sides", [(), ("x_low", "x_high", "y_low", "y_high", "z_low", "z_high")])
+@pytest.mark.parametrize("pull", [0.0, -9.81])
+def test_gravity_that_is_not_stored_is_noticed(
+    truth: Trajectory, caplog: pytest.LogCaptureFixture, sides: tuple[str, ...], pull: float
+) -> None:
+    """Walls on all sides or none do not tell the vertical, so images would turn a pull over."""
+    scene = with_walls(truth, *sides)
+    fall = (0.5 * pull * (DT * np.arange(truth.num_frames)) ** 2)[:, None, None] * np.array([0.0, 1.0, 0.0])
+    scene = replace(scene, pos=(scene.pos + fall).astype(np.float32))
+    for augmentation in (Augmentation(), Augmentation(boost_speed=1.0), Augmentation(quarter_turns=True)):
+        windows(scene, augmentation)
+    assert "no gravity is stored" not in caplog.text
+    windows(scene, Augmentation(mirror=True))
+    assert ("no gravity is stored, but nodes accelerate along y" in caplog.text) == (pull != 0)
+    caplog.clear()
+    windows(under(scene, gravity=(0.0, pull or -1.0, 0.0)), Augmentation(mirror=True))
+    assert not caplog.text
+
+
 def test_scenes_without_the_symmetry_are_refused(truth: Trajectory) -> None:
     with pytest.raises(AugmentationError, match=r"training.rotate=true: needs scenes in 3D"):
         Augmentation(rotate=True).check(under(truth, gravity=(1.0, 0.0, -9.0)))

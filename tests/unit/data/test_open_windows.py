@@ -61,6 +61,19 @@ def test_a_window_is_the_graph_of_the_rollout(data: WindowDataset, trajectory: T
     assert len(counts) > 3
 
 
+@pytest.mark.parametrize("phase", [0, 1])
+def test_windows_of_longer_frames_have_the_time_of_their_frame(data: WindowDataset, trajectory: Trajectory, phase: int) -> None:
+    """Openings with a speed that varies, and the nodes that enter, depend on it."""
+    (stored,) = data.trajectories
+    view = replace(stored, stride=2, phase=phase)
+    longer = WindowDataset([view], GraphBuilder(GraphConfig(history=HISTORY), view.window(0, 1).metadata), None, 0.1)
+    whole = trajectory.frames(phase).every(2) if phase else trajectory.every(2)
+    for window in range(len(longer)):
+        start, frame = longer[StartKey(window, window, 1)], longer.locate(window)[1]
+        assert isinstance(start, UnrollStart)
+        assert start.state.time == pytest.approx(whole.state(frame, HISTORY).time)
+
+
 def test_targets_are_those_of_nodes_that_stay_and_that_no_opening_moves(data: WindowDataset, trajectory: Trajectory) -> None:
     assert trajectory.alive is not None
     left_out = set()

@@ -13,7 +13,7 @@ from torch import Tensor
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
-from gpe_pl.learned.transfer import source_materials
+from gpe_pl.learned.transfer import keep_rollout_settings, source_materials
 from gpe_pl.models.base import LayersError
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
@@ -142,3 +142,16 @@ def test_early_layers_of_other_models(model: Any) -> None:
         return
     count = [sum(p.numel() for layer in made.early_layers(n) for p in layer.parameters()) for n in (0, 1, 2, 99)]
     assert 0 < count[0] < count[1] < count[2] <= count[3] <= sum(p.numel() for p in made.parameters())
+
+
+def test_a_model_that_is_not_trained_keeps_its_rollout_settings() -> None:
+    trained, wide = simulator(scenes.metadata(("sand",))), replace(scenes.metadata(("sand",)), spacing=2 * scenes.SPACING)
+    trained.static_friction, trained.mirror_average, trained.least_distance = 0.3, True, 0.01
+    new = simulator(wide, seed=1)
+    new.start_from(trained)
+    assert (new.static_friction, new.mirror_average, new.least_distance) == (0.0, False, 0.0)
+    keep_rollout_settings(new, trained)
+    assert (new.static_friction, new.mirror_average, new.least_distance) == (0.3, True, 0.02)
+    without_islands = simulator(scenes.metadata(("sand",)), config=GraphConfig(history=1))
+    keep_rollout_settings(without_islands, trained)
+    assert without_islands.static_friction == 0.0 and without_islands.least_distance == 0.01

@@ -171,6 +171,10 @@ def test_a_measurement_that_fails_writes_nothing(tmp_path: Path) -> None:
         (["training.push_fraction=0.9"], True),
         (["training.cuda_graph=off"], False),  # on a CPU, which has none
         (["training.push_fraction=0", "training.unroll_steps=2"], True),
+        (["training.targets=solver"], True),
+        (["training.mirror=true"], True),
+        (["training.neighbor_weight=1.0"], True),
+        (["training.early_layers=1"], True),
     ],
 )
 def test_a_step_is_measured_again_where_its_time_is_another(overrides: list[str], is_other: bool) -> None:

@@ -135,6 +135,21 @@ def test_the_root_loss_and_weights_by_neighbours_follow_their_formulas() -> None
     assert mean_num_neighbors([data], MATERIALS) == pytest.approx(sum(counts) / len(counts))
 
 
+@pytest.mark.parametrize("loss", ["square", "log", "root"])
+def test_errors_along_given_axes_do_not_count(loss: str) -> None:
+    m, data = module(loss=loss), batch()
+    for material in MATERIALS:
+        held = torch.zeros_like(data[material].target, dtype=torch.bool)
+        held[::2, 1] = True
+        data[material].prescribed = held
+    before = m.loss(data)
+    for material in MATERIALS:
+        data[material].target = torch.where(data[material].prescribed, 100.0, data[material].target)
+    torch.testing.assert_close(m.loss(data), before)
+    data["sand"].target = data["sand"].target + 1.0
+    assert not torch.isclose(m.loss(data), before)
+
+
 def test_the_validation_error_is_relative_to_predicting_free_fall() -> None:
     m, data = module(), batch()
     with torch.no_grad():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ import torch
 
 from gpe_pl.benchmarks.acceptance import particles, scenes, suite
 from gpe_pl.benchmarks.acceptance.suite import AcceptanceError, Settings, failures, run
-from gpe_pl.benchmarks.acceptance.trial import Candidate, Result, Trial, at_most, shown, tried
+from gpe_pl.benchmarks.acceptance.trial import Candidate, Result, Trial, TrialError, at_most, contained, shown, tried
+from gpe_pl.benchmarks.half_steps import HalfSteps
 from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec, trajectory_metadata
 from gpe_pl.graphs.builder import GraphBuilder
@@ -21,6 +23,7 @@ from gpe_pl.learned.verdicts import headline
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Termination
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +83,43 @@ def test_a_stopped_suite_continues_with_the_next_scene(
     assert headline(checkpoint) == "acceptance not measured"
     records, _ = run(settings, {"sand": spec}, tmp_path)
     assert [r["name"] for r in records] == ["scene 1", "scene 3", "scene 4"] and len(seen) == 4
+
+
+def test_a_checkpoint_that_is_replaced_during_the_suite_gets_no_verdict(
+    spec: DatasetSpec, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def replacing(candidate: Candidate) -> Result:
+        candidate.simulator.acceleration_std.fill_(2.0)
+        candidate.simulator.save(checkpoint)
+        return Result([at_most("a scene", [0.0], 1.0, "")], [])
+
+    monkeypatch.setattr(suite, "SCENES", {"column": {"sand": replacing}})
+    with pytest.raises(AcceptanceError, match=r"best.ckpt: was replaced while the suite ran"):
+        run(Settings({}, [str(checkpoint)]), {"sand": spec}, tmp_path)
+    assert headline(checkpoint) == "acceptance not measured" and not [*tmp_path.rglob("*.acceptance.json")]
+
+
+@pytest.mark.parametrize("who", ["the solver", "the solver with half its time step"])
+def test_a_solver_that_stops_is_no_reference(spec: DatasetSpec, checkpoint: Path, monkeypatch: pytest.MonkeyPatch, who: str) -> None:
+    from gpe_pl.benchmarks.acceptance import trial
+
+    def stopping(simulator: Any, *args: Any) -> Any:
+        found = rollout(simulator, *args)
+        is_stopped = isinstance(simulator, HalfSteps) == (who != "the solver")
+        return replace(found.frames(0, 3), termination=Termination("nan", 3, 0, "frame 3: node 0")) if is_stopped else found
+
+    monkeypatch.setattr(trial, "rollout", stopping)
+    candidate = Candidate("own", LearnedSimulator.from_checkpoint(checkpoint), spec)
+    with pytest.raises(TrialError, match=f"sand: {who} stopped early, so there is nothing to compare with: frame 3"):
+        tried(candidate, 30.0, scenes.column(spec, 30.0, 4, 2), 0.02)
+
+
+def test_a_model_that_stops_has_no_containment_to_judge(spec: DatasetSpec, checkpoint: Path) -> None:
+    simulator = LearnedSimulator.from_checkpoint(checkpoint)
+    simulator.acceleration_std.fill_(1e9)
+    found = tried(Candidate("own", simulator, spec), 30.0, scenes.column(spec, 30.0, 4, 2), 0.02)
+    check = contained("column", [found])
+    assert found.model.termination is not None and not check.passed and check.measured == "stopped %"
 
 
 def test_a_model_without_scenes_and_two_of_one_name_are_refused(spec: DatasetSpec, checkpoint: Path, tmp_path: Path) -> None:

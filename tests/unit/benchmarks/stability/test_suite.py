@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.benchmark import benchmark
 from gpe_pl.benchmarks.stability import conservation, geometry, horizon, inputs, invariances, precision, suite
 from gpe_pl.benchmarks.stability.horizon import energy, growth_rate, separation, valid_steps
-from gpe_pl.benchmarks.stability.subject import Outcome, StressTest, Subject
+from gpe_pl.benchmarks.stability.subject import Outcome, StressTest, Subject, largest
 from gpe_pl.benchmarks.stability.suite import GROUPS, NothingToTestError, ReplacedError, Settings, figures, is_gating, run
 from gpe_pl.benchmarks.stability.suite import test as run_tests
 from gpe_pl.benchmarks.trained import Case, model_label, trained_on
@@ -135,6 +136,20 @@ def test_an_exploding_model_fails(spec: DatasetSpec, scenes: list[Trajectory]) -
     assert outcome.passed is False
     assert "stopped at frame 1: " in outcome.measured
     assert all(f <= 2 for f in outcome.curves["steps_to_failure"])
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4, 7])
+def test_a_model_that_answers_nan_fails(spec: DatasetSpec, scenes: list[Trajectory], monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """Only the first comparison is finite, so the largest by ``max`` would be that one."""
+    changes = itertools.chain([0.0], itertools.repeat(float("nan")))
+    monkeypatch.setattr(invariances, "relative_change", lambda *_: next(changes))
+    (stress_test,) = (test for test in invariances.TESTS if test.number == number)
+    assert stress_test(subject(spec, scenes)).passed is False
+
+
+def test_the_largest_of_several_values_is_nan_if_one_is() -> None:
+    assert largest([1.0, 3.0, 2.0]) == 3.0
+    assert np.isnan(largest([1.0, float("nan"), 2.0]))
 
 
 def test_energy_is_kinetic_and_of_height(spec: DatasetSpec, scenes: list[Trajectory]) -> None:
