@@ -104,7 +104,7 @@ class Predictor:
             while batch := list(islice(scenes, SCENES_AT_ONCE)):
                 numbers, trajectories = [number for number, _ in batch], [trajectory for _, trajectory in batch]
                 for trajectory in trajectories:
-                    check_scene(self.settings, trajectory)
+                    check_scene(self.settings, trajectory, members_of(self.simulator)[0].builder.metadata)
                 yield from self._batch(trajectories, numbers, controls, _each(on_progress, done, total))
                 done += self._num_frames([t.num_frames for t in trajectories])
                 on_progress(done, total)  # rollouts that stopped early lack frames

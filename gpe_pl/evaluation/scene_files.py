@@ -17,11 +17,11 @@ from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.evaluation.settings import EvaluationSettings, Export
 from gpe_pl.export.onnx_network import export_network
 from gpe_pl.export.play_model import check
-from gpe_pl.export.play_page import SolverFilm, write_page
+from gpe_pl.export.play_page import SolverFilm, check_film, write_page
 from gpe_pl.export.program import export_model, refuse_rigid_bodies
 from gpe_pl.learned.ensemble import LearnedEnsemble
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from gpe_pl.viz.saving import save_figure
 
 log = logging.getLogger(__name__)
@@ -64,10 +64,17 @@ def check_formats(settings: EvaluationSettings, simulator: LearnedSimulator | Le
         )
 
 
-def check_scene(settings: EvaluationSettings, trajectory: Trajectory) -> None:
-    """Raise ``RigidBodyError`` if ``settings.export`` has a program that would ignore the rigid bodies of this scene."""
+def check_scene(settings: EvaluationSettings, trajectory: Trajectory, own: Metadata) -> None:
+    """Raise an error if ``settings.export`` has something that would compute this scene otherwise than a model with the metadata ``own``.
+
+    Raises:
+        RigidBodyError: a program would ignore the rigid bodies of the scene.
+        PageError: a page would have another gravity, domain or boundary.
+    """
     if {"model", "page"} & {*settings.export}:
         refuse_rigid_bodies(trajectory.rigid_body)
+    if "page" in settings.export:
+        check_film(own, trajectory)
 
 
 def save(figure: Figure, path: Path, formats: Sequence[Export], **options: Any) -> None:

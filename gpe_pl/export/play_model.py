@@ -73,6 +73,10 @@ def check(simulator: LearnedSimulator) -> None:
         wrong = f"a model with {' '.join(different)}"
     elif model.settings["material_embedding"] == "mlp":
         wrong = "a model with model.material_embedding=mlp"
+    elif simulator.mirror_average:
+        wrong = "a model that averages over mirror images (mirror_average)"
+    elif not simulator.clamps_parameters:
+        wrong = "a model that does not clamp material parameters to the trained range"
     elif simulator.least_distance:
         wrong = "a model with a least distance of liquid nodes"
     elif builder.config.features != "contact" or not builder.config.boundary_condition:

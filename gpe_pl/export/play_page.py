@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.errors import GpeError
-from gpe_pl.export.play_model import model_for_page
-from gpe_pl.export.play_scene import state_for_page
+from gpe_pl.export.play_model import PageError, model_for_page
+from gpe_pl.export.play_scene import check_boundary, state_for_page
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.names import portable
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 PARTS = Path(__file__).parent / "play"
 MODULES = ("kernels", "network", "shapes", "step", "world", "view", "play")
@@ -62,7 +62,7 @@ def write_page(
 
     Raises:
         PageFolderError: there is no model.
-        PageError: the page cannot compute a model, or does not know an obstacle.
+        PageError: the page cannot compute a model or a film's walls, or a film has another gravity or domain than its model.
         SceneError: a film does not fit its model.
     """
     if not simulators:
@@ -86,10 +86,24 @@ def _model_script(name: str, simulator: LearnedSimulator, films: Sequence[Solver
     return f"(window.gpeModels ||= []).push({json.dumps(about, allow_nan=False)});\n"
 
 
+def check_film(metadata: Metadata, trajectory: Trajectory) -> None:
+    """Raise ``PageError`` for a scene that a page cannot show beside a model with these metadata."""
+    for name, own, other in (
+        ("gravity", metadata.gravity, trajectory.metadata.gravity),
+        ("bounds", metadata.bounds, trajectory.metadata.bounds),
+    ):
+        if not np.allclose(own, other):
+            raise PageError(
+                f"the scene has {name}={list(other)}, a page has that of the model, {list(own)}; leave this scene, or the page, out"
+            )
+    check_boundary(trajectory.boundary)
+
+
 def _scene(simulator: LearnedSimulator, film: SolverFilm) -> dict[str, Any]:
     """Return the start of a film, and its positions from there on, rounded to 16 bits over the domain."""
     builder, first = simulator.builder, simulator.builder.config.history
     trajectory = film.trajectory
+    check_film(builder.metadata, trajectory)
     start = state_for_page(simulator.initial_state(trajectory, first), builder.metadata.columns_of(builder.spec.materials[0]))
     low, high = np.asarray(builder.metadata.bounds, float).T
     place = (trajectory.pos[first:].astype(np.float64) - low) / (high - low)

@@ -10,7 +10,7 @@ import numpy as np
 from gpe_pl.export.play_model import PageError
 from gpe_pl.export.program import refuse_openings, refuse_rigid_bodies
 from gpe_pl.geometry.shapes import Shape
-from gpe_pl.trajectory.boundary import as_numpy
+from gpe_pl.trajectory.boundary import Boundary, as_numpy
 from gpe_pl.trajectory.state import State
 
 KINDS = ("wall", "sphere", "bowl", "box", "polygon")
@@ -28,6 +28,14 @@ def shape_for_page(shape: Shape) -> dict[str, Any]:
     return {"kind": shape.kind, **asdict(shape)}  # type: ignore[call-overload]
 
 
+def check_boundary(boundary: Boundary) -> None:
+    """Raise ``PageError`` for walls and obstacles that move, or that have points only."""
+    if boundary.motion is not None or bool((as_numpy(boundary.vel) != 0).any()):
+        raise PageError("pages have walls and obstacles that stand still; leave out scenes in which they move")
+    if len(boundary.pos) and not boundary.shapes:
+        raise PageError("pages compute walls and obstacles from their shapes; leave out scenes whose boundary has points only")
+
+
 def state_for_page(state: State, columns: list[int]) -> dict[str, Any]:
     """Return a state with velocity history as plain values.
 
@@ -36,12 +44,13 @@ def state_for_page(state: State, columns: list[int]) -> dict[str, Any]:
         columns: columns of the material's parameters.
 
     Raises:
-        PageError: the page does not know a wall or obstacle.
+        PageError: the page does not know a wall or obstacle, walls move, or have points only.
         RigidBodyError: the state has rigid bodies.
         OpenSceneError: the state has inlets or outlets.
     """
     refuse_rigid_bodies(state.rigid_body)
     refuse_openings(state)
+    check_boundary(state.boundary)
     history = state.vel[:, None] if state.velocity_history is None else state.velocity_history
     return {
         "count": state.num_nodes,

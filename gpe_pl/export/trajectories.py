@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import math
 import shutil
 import zlib
 from collections.abc import Iterator, Mapping
@@ -25,7 +26,7 @@ from gpe_pl.metrics import displacement
 from gpe_pl.schema import CELL_KINDS
 from gpe_pl.trajectory.cells import cell_edges, is_corner, kinds_of
 from gpe_pl.trajectory.state import von_mises
-from gpe_pl.trajectory.store import stored_arrays, stored_attributes
+from gpe_pl.trajectory.store import PREDICTION, stored_arrays, stored_attributes
 from gpe_pl.trajectory.trajectory import Trajectory
 
 VERTEX = 1
@@ -41,7 +42,8 @@ VTK_TYPES = {"float32": "Float32", "float64": "Float64", "int32": "Int32", "int6
 def write_npz(path: Path | str, trajectory: Trajectory) -> None:
     """Write a trajectory as arrays that ``numpy.load`` reads, in the precision of the store. The file is written atomically.
 
-    Names, shapes and units are those of ``schema.FIELDS``; ``metadata``, ``shapes`` and ``node_types`` are JSON. ``convert format=arrays`` imports such files.
+    Names, shapes and units are those of ``schema.FIELDS``; ``metadata``, ``shapes`` and ``node_types`` are JSON. Rollouts of models also have
+    ``prediction``. ``convert format=arrays`` imports such files, other than rollouts of models.
 
     Raises:
         ValueError: ``path`` does not end in ``.npz``.
@@ -50,6 +52,7 @@ def write_npz(path: Path | str, trajectory: Trajectory) -> None:
     if path.suffix != ".npz":
         raise ValueError(f"{path}: a NumPy archive ends in .npz")
     texts = {key: np.array(text) for key, text in stored_attributes(trajectory).items()}
+    texts |= {PREDICTION: np.array("")} if trajectory.is_prediction else {}
     with replacing(path) as part:
         np.savez_compressed(part, allow_pickle=False, **stored_arrays(trajectory), **texts)
 
@@ -87,6 +90,10 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     if ground_truth is not None and (ground_truth.num_nodes != trajectory.num_nodes or ground_truth.num_frames < trajectory.num_frames):
         raise ValueError(
             f"{path}: the ground truth has {ground_truth.pos.shape[:2]} frames and nodes, the trajectory {trajectory.pos.shape[:2]}"
+        )
+    if ground_truth is not None and not math.isclose(trajectory.metadata.frame_dt, ground_truth.metadata.frame_dt, rel_tol=1e-6):
+        raise ValueError(
+            f"{path}: frames are {trajectory.metadata.frame_dt:g} s long, those of the ground truth {ground_truth.metadata.frame_dt:g} s"
         )
     if trajectory.alive is not None and trajectory.cells is not None:
         raise ValueError(f"{path}: meshes of open scenes are not written; write a NumPy archive")

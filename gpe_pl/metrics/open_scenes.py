@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from gpe_pl.trajectory.living import held
 from gpe_pl.trajectory.trajectory import Trajectory
 
 UNITS: dict[str, str] = {"mass_error": "1", "outflow_error": "1"}
@@ -20,11 +21,7 @@ def present(trajectory: Trajectory) -> Bool[np.ndarray, "frame node"]:
 
 def places(trajectory: Trajectory) -> Float[np.ndarray, "frame node dim"]:
     """Return the positions [m]. Before a node enters and after it has left, its place is that of the nearest frame in which it is in the scene."""
-    if trajectory.alive is None:
-        return trajectory.pos
-    first, after = trajectory.alive.argmax(axis=0), trajectory.alive[::-1].argmax(axis=0)
-    frame = np.clip(np.arange(trajectory.num_frames)[:, None], first, trajectory.num_frames - 1 - after)
-    return np.take_along_axis(trajectory.pos, frame[..., None], axis=0)
+    return trajectory.pos if trajectory.alive is None else held(trajectory.pos, trajectory.alive)
 
 
 def entering(trajectory: Trajectory) -> Int[np.ndarray, " frame"]:

@@ -19,7 +19,17 @@ from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import BOTH, bootstrap_interval, median_of_means
 from gpe_pl.reports.domain_table import TABLE_MD, TABLES, domain_of, model_of
-from gpe_pl.reports.finished_runs import Run, axes_of, rollout_errors, shared_table, validation_curve, values_by_seed
+from gpe_pl.reports.finished_runs import (
+    Run,
+    axes_of,
+    distinct_runs,
+    rollout_errors,
+    shared_table,
+    starts_of,
+    validation_curve,
+    values_by_seed,
+)
+from gpe_pl.reports.stride_table import DIFFERENT_STARTS
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +52,7 @@ def report_trials(folder: Path, runs: list[Run]) -> None:
 
     An existing table of ``domain_table`` is deleted, because it would not show all runs.
     """
+    runs = distinct_runs(runs)
     groups = _by_model(runs)
     settings = sorted({key for members in groups.values() for key in _settings(members)})
     splits = sorted({split for run in runs for split in run.rows["split"]})
@@ -56,7 +67,11 @@ def report_trials(folder: Path, runs: list[Run]) -> None:
         error = {v: {s: _error(runs, s) for s in splits} for v, runs in variants.items()}
         best = {s: min(error[v][s] for v in variants) for s in splits}
         for v, runs in sorted(variants.items()):
-            cells = [_cell(runs, s, error[v][s], is_best=bool(np.isfinite(error[v][s]) and error[v][s] == best[s])) for s in splits]
+            is_compared = len(starts_of(members)) < 2
+            cells = [
+                _cell(runs, s, error[v][s], is_best=bool(is_compared and np.isfinite(error[v][s]) and error[v][s] == best[s]))
+                for s in splits
+            ]
             losses = [loss[-1] for _, loss in (validation_curve(r) for r in runs) if len(loss)]
             lines.append(table_row([domain, model, *v, str(len(runs)), f"{np.mean(losses):.3f}" if losses else "–", *cells]))
     note = (
@@ -65,7 +80,9 @@ def report_trials(folder: Path, runs: list[Run]) -> None:
         "best of a domain and model. "
         "One-step nMSE: of the validation split, relative to free fall."
     )
-    replace_text(folder / TRIALS_MD, "\n".join([*lines, "", note, ""]))
+    starts = next((found for members in groups.values() if len(found := starts_of(members)) > 1), [])
+    warning = ["", f"**{DIFFERENT_STARTS.format(', '.join(starts))}**"] if starts else []
+    replace_text(folder / TRIALS_MD, "\n".join([*lines, "", note, *warning, ""]))
     if (folder / TABLE_MD).exists():
         for name in TABLES:
             (folder / name).unlink(missing_ok=True)

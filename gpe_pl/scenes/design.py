@@ -77,12 +77,12 @@ class Design:
 
         lines = [f"best pose: {text(self.pose)}"]
         lines += [
-            f"{name}: distance from the target {after:.3g} m, {before:.3g} m at the start"
+            f"{name}: distance from the target {_in_metres(after)}, {_in_metres(before)} at the start"
             for name, (before, after) in self.distances.items()
         ]
         if len(self.distances) == 2:
             promised, kept = (before - after for before, after in self.distances.values())
-            if promised > 0:
+            if promised > 0 and not math.isnan(kept):
                 lines.append(f"the solver keeps {100 * kept / promised:.0f} % of the improvement that the model promises")
         way = self.method.replace("_", "-")
         lines.append(
@@ -94,6 +94,10 @@ class Design:
         """Return the rollouts at the best pose."""
         first, *_ = self.rollouts
         return Film(self.scene.title, self.rollouts[first], {key: value for key, value in self.rollouts.items() if key != first})
+
+
+def _in_metres(distance: float) -> str:
+    return "not known, as the rollout stopped early" if math.isnan(distance) else f"{distance:.3g} m"
 
 
 def design(
@@ -150,16 +154,24 @@ def design(
         )
     spent, best = time.process_time() - began, tuple(guidance.pose(found.z).tolist())
     moved = replace(scene, obstacles=tuple((n, movable.moved_shape(best) if n == name else own) for n, own in scene.obstacles))
-    distances = {"model": (math.exp(before / 2), math.exp(found.misfit / 2))}
+    failed = math.log(guidance.failed)
+    distances = {"model": (math.nan if before >= failed else math.exp(before / 2), math.exp(found.misfit / 2))}
     rollouts, at_best = {}, moved.state(simulator)[0]
     if solve:
         solver = scene.solver_of(simulator)
         pair = [solved(solver, s, metadata, num_frames, f"solver {solver.name}") for s in (state, at_best)]
-        before_it, after_it = (float(np.sqrt(np.mean(np.sum((t.pos[-1].astype(np.float64) - goal) ** 2, axis=1)))) for t in pair)
+        before_it, after_it = (_distance(own, goal) for own in pair)
         distances["solver"], rollouts["solver"] = (before_it, after_it), pair[1]
     rollouts["model"] = predicted(simulator, at_best, metadata, num_frames, "model")
     check = "" if found.check is None else str(found.check)
     return Design(moved, best, distances, rollouts, found.method, check, guidance.num_evaluations, guidance.num_gradients, spent)
+
+
+def _distance(trajectory: Trajectory, goal: np.ndarray) -> float:
+    """Return the root mean square distance [m] of the nodes from a point [dim] in the last frame; NaN for a rollout that stopped early."""
+    if trajectory.termination is not None:
+        return math.nan
+    return float(np.sqrt(np.mean(np.sum((trajectory.pos[-1].astype(np.float64) - goal) ** 2, axis=1))))
 
 
 def _check(scene: Scene, target: Point, obstacle: int, shift: float, angle: float, seconds: float, method: str, evaluations: int) -> None:

@@ -46,6 +46,8 @@ EARTH = 9.81
 """Acceleration of gravity [m/s²] if none is given."""
 CLOSEST = 0.3
 """Smallest distance of nodes of two bodies [spacings]."""
+OF_ONE_DENSITY = ("mpm", "flip")
+"""Solvers that take the volume of a node from its mass at the density of the data, so another mass would be another volume."""
 SHIPPED = {"sand": "sand", "snow": "snow", "elastomer": "elastomer", "fluid": "fluid", "solid": "fem"}
 """Shipped model of each material, which a scene takes if none is named."""
 
@@ -286,11 +288,11 @@ class Scene:
         own = simulator.builder.metadata
         if own.dim != self.dim:
             raise SceneFault({"box": f"has {self.dim} axes, the model is for {own.dim}D"}, self)
-        if not self._filled:
+        if not self.filled:
             raise SceneFault({"": "the scene has no body; add one, such as .block('sand', at=(0.1, 0.0), size=(0.2, 0.4))"}, self)
         rng, faults = np.random.default_rng(self.seed), self._misplaced()
         shapes = self._shapes(own.spacing, faults)
-        values = {body.name: self._values(body, simulator, faults) for body in self._filled}
+        values = {body.name: self._values(body, simulator, faults) for body in self.filled}
         found: dict[str, Nodes] = {}
         for body in self.bodies:
             if body.name not in faults:
@@ -341,8 +343,18 @@ class Scene:
         return simulator.at(self.spacing, self.frame_dt) if self.spacing or self.frame_dt else simulator
 
     def solver_of(self, simulator: LearnedSimulator) -> Any:
-        """Return the solver of the model's training data for this box, rounded up to whole cells of its grid."""
+        """Return the solver of the model's training data for this box, rounded up to whole cells of its grid.
+
+        Raises:
+            SceneFault: a body has another density than the solver, whose nodes have the volume of a mass at its own density.
+        """
         own = simulator.builder.metadata
+        if own.solver in OF_ONE_DENSITY:
+            usual = {body.name: self._density(replace(body, density=None), simulator) for body in self.filled}
+            fault = "density: the solver of these data computes with {:g} kg/m³ only; leave density out, or predict without solving"
+            wrong = {body.name: fault.format(usual[body.name]) for body in self.filled if body.density not in (None, usual[body.name])}
+            if wrong:
+                raise SceneFault(wrong, self)
         cell = settings(own)["solver"].get("grid_spacing")
         at_scale: dict[str, float] = {}
         if simulator.builder.reference is not None:  # the settings are those of another scale
@@ -353,7 +365,7 @@ class Scene:
 
     def shipped(self) -> str:
         """Return the name of the shipped model of the material; raises ``SceneFault`` if there are several materials."""
-        materials = {body.material for body in self._filled}
+        materials = {body.material for body in self.filled}
         if len(materials) != 1:
             here = ", ".join(sorted(materials)) or "the scene"
             raise SceneFault({"model": f"name one for {here}; shipped models ({', '.join(names())}) have one material each"})
@@ -385,7 +397,7 @@ class Scene:
         return replace(self, bodies=(*self.bodies, body))
 
     @property
-    def _filled(self) -> tuple[Body, ...]:
+    def filled(self) -> tuple[Body, ...]:
         """Bodies, and what is in inlets at the start."""
         return (*self.bodies, *(zone.body for zone in self.zones if zone.body is not None))
 
@@ -497,7 +509,7 @@ class Scene:
         pos = np.concatenate([nodes.pos for nodes in found.values()])
         params, first, cells = np.full((len(pos), len(own.param_names)), np.nan), 0, []
         vel, node_type = np.empty_like(pos), np.empty(len(pos), np.uint8)
-        for body in self._filled:
+        for body in self.filled:
             nodes = found[body.name]
             rows = slice(first, first + len(nodes.pos))
             vel[rows], node_type[rows] = body.velocity, node_code(body.material)

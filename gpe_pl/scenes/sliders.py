@@ -12,6 +12,7 @@ from gpe_pl.scenes.rollouts import middle_values
 from gpe_pl.viz.captions import parameter_name
 
 if TYPE_CHECKING:
+    from gpe_pl.scenes.bodies import Body
     from gpe_pl.scenes.scene import Scene
 
 
@@ -22,7 +23,7 @@ class NotebookError(GpeError, ImportError):
 def sliders(scene: Scene, model: str, seconds: float | int) -> Any:
     """Return a widget with a slider for each trained parameter of the scene's materials, over its trained range, and the viewer of the prediction.
 
-    A parameter of all bodies of a material has one slider. It begins at the value of the first of them, or in the middle of the trained range.
+    A parameter of all bodies and inlets of a material has one slider. It begins at the value of the first of them, or in the middle of the trained range.
 
     Args:
         scene: the scene.
@@ -42,7 +43,7 @@ def sliders(scene: Scene, model: str, seconds: float | int) -> Any:
     middle, own = middle_values(simulator), simulator.builder.metadata
     chosen: dict[tuple[str, str], Any] = {}
     for material, trained in simulator.trained_ranges():
-        given = next((body.parameters for body in scene.bodies if body.material == material), None)
+        given = next((body.parameters for body in scene.filled if body.material == material), None)
         for spec, _, (low, high) in stored_ranges(own, material, trained):
             if given is None or not low < high:
                 continue
@@ -63,15 +64,16 @@ def sliders(scene: Scene, model: str, seconds: float | int) -> Any:
 
     def predict(_: Any = None) -> None:
         values = {key: slider.value for key, slider in chosen.items()}
-        bodies = tuple(
-            replace(
-                body, parameters={**body.parameters, **{name: v for (material, name), v in values.items() if material == body.material}}
-            )
-            for body in scene.bodies
-        )
+
+        def changed(body: Body) -> Body:
+            own = {name: value for (material, name), value in values.items() if material == body.material}
+            return replace(body, parameters={**body.parameters, **own})
+
+        bodies = tuple(map(changed, scene.bodies))
+        zones = tuple(zone if zone.body is None else replace(zone, body=changed(zone.body)) for zone in scene.zones)
         messages.clear_output(wait=True)
         with messages:  # the progress bar
-            viewer.value = replace(scene, bodies=bodies).predict(model, seconds)._repr_html_()
+            viewer.value = replace(scene, bodies=bodies, zones=zones).predict(model, seconds)._repr_html_()
 
     for slider in chosen.values():
         slider.observe(predict, "value")

@@ -360,7 +360,9 @@ def estimated_normals(boundary_pos: np.ndarray, visited: np.ndarray, periodicity
 
     walls = np.asarray(boundary_pos, np.float64)
     points = np.asarray(visited).reshape(-1, walls.shape[1])
-    points = points[:: -(-len(points) // MAX_VISITED)].astype(np.float64)
+    if len(points) > MAX_VISITED:  # drawn at random: every so many points would be the same few nodes in all frames
+        points = points[np.random.default_rng(0).choice(len(points), MAX_VISITED, replace=False)]
+    points = points.astype(np.float64)
     count = min(NEIGHBOURS, len(points))
     if periodicity:
         tree = cKDTree(periodicity.from_corner(points), boxsize=periodicity.period)

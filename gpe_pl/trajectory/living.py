@@ -53,6 +53,11 @@ def columns(
     for frame, (own, rows) in enumerate(zip(ids, frames, strict=True)):
         place = np.searchsorted(known, own)
         alive[frame, place], values[frame, place] = True, rows
+    return held(values, alive), alive, known
+
+
+def held(values: np.ndarray, alive: Bool[np.ndarray, "frame node"]) -> np.ndarray:
+    """Return values [frame, node, …] in which a node that is not in the scene has the value of the nearest frame in which it is."""
     first, last = alive.argmax(axis=0), len(alive) - 1 - alive[::-1].argmax(axis=0)
     nearest = np.clip(np.arange(len(alive))[:, None], first, last)
-    return values[nearest, np.arange(len(known))], alive, known
+    return np.asarray(values[nearest, np.arange(values.shape[1])])

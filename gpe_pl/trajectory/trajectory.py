@@ -32,7 +32,7 @@ from gpe_pl.trajectory.arrays import (
 )
 from gpe_pl.trajectory.boundary import Array, Boundary, check_steps
 from gpe_pl.trajectory.cells import mean_over_corners
-from gpe_pl.trajectory.living import living
+from gpe_pl.trajectory.living import held, living
 from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State, Stress
@@ -441,12 +441,14 @@ class Trajectory:
         if first == 0 and last == self.num_frames:
             return self
         stress = None if self.stress is None else Stress(self.stress.node[start:stop], self.stress.cell[start:stop])
+        end = self.termination
         return replace(
             self,
             pos=self.pos[start:stop],
             vel=self.vel[start:stop],
             boundary=self.boundary.at(start, stop),
             stress=stress,
+            termination=None if end is None else replace(end, frame=end.frame - first),
             alive=None if self.alive is None else self.alive[start:stop],
             force=None if self.force is None else self.force[start:stop],
             start_time=self.start_time + first * self.metadata.frame_dt,
@@ -460,11 +462,14 @@ class Trajectory:
         if stride == 1:
             return self
         stop = self.termination
+        pos, vel = (
+            values[::stride] if self.alive is None else held(values[::stride], self.alive[::stride]) for values in (self.pos, self.vel)
+        )
         return replace(
             self,
             metadata=self.metadata.every(stride),
-            pos=self.pos[::stride],
-            vel=self.vel[::stride],
+            pos=pos,
+            vel=vel,
             boundary=self.boundary.every(stride),
             stress=None if self.stress is None else Stress(self.stress.node[::stride], self.stress.cell[::stride]),
             alive=None if self.alive is None else self.alive[::stride],

@@ -1,5 +1,6 @@
 """Captions of pictures: names of trajectories, their materials and parameter values."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,11 +23,17 @@ def with_heading(first: Trajectory, others: Mapping[str, Trajectory]) -> dict[st
     """Return all trajectories by name. The first one is called ``ground truth`` or ``prediction``, see ``heading``.
 
     Raises:
-        ValueError: another trajectory has the name of the first.
+        ValueError: another trajectory has the name of the first, or frames of another length.
     """
     name = heading(first)
     if name in others:
         raise ValueError(f"{name!r} is the name of the first trajectory; give the other trajectory another name")
+    for label, other in others.items():
+        if not math.isclose(other.metadata.frame_dt, first.metadata.frame_dt, rel_tol=1e-6):
+            raise ValueError(
+                f"{label!r} has frames of {other.metadata.frame_dt:g} s and the {name} of {first.metadata.frame_dt:g} s; take every so many frames of one "
+                "(Trajectory.every)"
+            )
     return {name: first, **others}
 
 

@@ -31,7 +31,7 @@ def contact_sheet(trajectories: Mapping[str, Trajectory], num_columns: int = 6) 
     """
     if not trajectories:
         raise ValueError("a contact sheet needs at least one trajectory")
-    trajectories = {label: trajectory.with_moving_boundary() for label, trajectory in trajectories.items()}
+    trajectories = {label: trajectory.with_moving_boundary().with_absent_hidden() for label, trajectory in trajectories.items()}
     shown = list(trajectories.values())
     frames = evenly_spaced_frames(max(trajectory.num_frames for trajectory in shown), num_columns)
     return film_strip(list(trajectories.items()), frames, Coloring(informative_color(shown), shown, frames), DPI)

@@ -60,7 +60,7 @@ def parameter_strip(scenes: Sequence[tuple[str, Trajectory, Trajectory]], num_co
         num_columns: number of times; fewer if there are fewer frames.
     """
     rows = [
-        (f"{who}\n{caption}", trajectory.with_moving_boundary())
+        (f"{who}\n{caption}", trajectory.with_moving_boundary().with_absent_hidden())
         for caption, *pair in scenes
         for who, trajectory in zip(("solver", "model"), pair, strict=True)
     ]

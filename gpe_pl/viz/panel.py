@@ -139,7 +139,7 @@ class Panel:
         if frame < self.trajectory.num_frames:
             pos = self.trajectory.metadata.periodicity.wrapped(self.trajectory.pos[frame].astype(np.float64))
             self._show(pos, *self.coloring(self.trajectory, frame))
-            self.note.set_text("")
+            self.note.set_text(self._outside(pos))
             return
         self._show(np.full(self.trajectory.pos.shape[1:], np.nan), *self.coloring(self.trajectory, 0))
         stop = self.trajectory.termination
@@ -147,6 +147,13 @@ class Panel:
             self.note.set_text("not simulated")
         else:
             self.note.set_text(f"stopped at {stop.frame * self.trajectory.metadata.frame_dt:.2f} s\n({stop.reason})")
+
+    def _outside(self, pos: Float[np.ndarray, "node dim"]) -> str:
+        """Return how many nodes are farther outside the domain than a rest spacing, where the panel does not show them; empty if none is."""
+        metadata = self.trajectory.metadata
+        low, high = np.asarray(metadata.bounds, float).T
+        beyond = ((pos < low - metadata.spacing) | (pos > high + metadata.spacing)).any(axis=1)
+        return f"{int(beyond.sum())} of {len(pos)} nodes are outside" if beyond.any() else ""
 
     def _show(
         self, pos: Float[np.ndarray, "node dim"], node_colors: Float[np.ndarray, "node 4"], cell_colors: Float[np.ndarray, "cell 4"]

@@ -63,7 +63,15 @@ def write_animation(
 
 def write_film(path: Path | str, name: str, trajectory: Trajectory, fps: int | float = 25, color: ColorBy = "height") -> None:
     """Write an animation of a single trajectory, larger than in ``write_animation``. ``name`` is the title of its panel; other arguments are as there."""
-    _write(Path(path), {name: trajectory.with_moving_boundary()}, range(trajectory.num_frames), fps, color, None, FILM_PIXELS)
+    _write(
+        Path(path),
+        {name: trajectory.with_moving_boundary().with_absent_hidden()},
+        range(trajectory.num_frames),
+        fps,
+        color,
+        None,
+        FILM_PIXELS,
+    )
 
 
 def _write(

@@ -15,12 +15,12 @@ import pytest
 import torch
 
 from gpe_pl.export.play_model import PageError, model_for_page
-from gpe_pl.export.play_page import PARTS
+from gpe_pl.export.play_page import PARTS, check_film
 from gpe_pl.export.play_scene import state_for_page
 from gpe_pl.geometry.shapes import Bowl, Box, Polygon, Shape, Sphere, Wall
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import steps
+from gpe_pl.rollout.loop import rollout, steps
 from gpe_pl.schema import node_code
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
@@ -163,3 +163,28 @@ def test_other_models_are_refused_with_what_the_page_computes(name: str) -> None
 
 def test_the_parts_are_in_the_package() -> None:
     assert {path.suffix for path in Path(PARTS).iterdir()} == {".mjs", ".html", ".css"}
+
+
+def test_pages_refuse_what_they_would_compute_otherwise() -> None:
+    for name, value, message in (
+        ("mirror_average", True, "averages over mirror images"),
+        ("clamps_parameters", False, "does not clamp material parameters"),
+    ):
+        simulator = LearnedSimulator.from_checkpoint("sand")
+        setattr(simulator, name, value)
+        with pytest.raises(PageError, match=message):
+            model_for_page(simulator)
+    simulator = LearnedSimulator.from_checkpoint("sand")
+    state = scene(simulator, (FLOOR,))
+    points = replace(state, boundary=replace(state.boundary, shapes=()))
+    with pytest.raises(PageError, match="boundary has points only"):
+        state_for_page(points, [0])
+    moving = replace(state, boundary=replace(state.boundary, vel=state.boundary.vel + 1.0))
+    with pytest.raises(PageError, match="walls and obstacles that stand still"):
+        state_for_page(moving, [0])
+    own = simulator.builder.metadata
+    film = rollout(Contained(simulator, own.frame_dt), state, 2, own)
+    check_film(own, film)
+    for change in ({"gravity": (0.0, -1.62)}, {"bounds": ((0.0, 2.0), (0.0, 1.0))}):
+        with pytest.raises(PageError, match=f"the scene has {next(iter(change))}="):
+            check_film(own, replace(film, metadata=replace(own, **change)))  # type: ignore[arg-type]

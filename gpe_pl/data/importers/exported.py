@@ -15,7 +15,7 @@ import numpy as np
 from gpe_pl.data.importers import npz
 from gpe_pl.data.importers.source import Facts, Loaded, Refusal
 from gpe_pl.schema import FIELDS
-from gpe_pl.trajectory.store import ADVICE, ATTRIBUTES, FURTHER, StoreError, UnsoundError, fill_group, trajectory_in
+from gpe_pl.trajectory.store import ADVICE, ATTRIBUTES, FURTHER, PREDICTION, StoreError, UnsoundError, fill_group, trajectory_in
 
 KEY = "metadata"
 """Name of an array that every exported archive has, and no other file of the format ``arrays``."""
@@ -30,8 +30,11 @@ def load(path: Path, names: Sequence[str], given: Facts) -> Loaded:
         given: what the settings of the command state.
 
     Raises:
-        Refusal: an array is missing, unknown, damaged or invalid, the scene is open, or a setting would change what the archive states.
+        Refusal: an array is missing, unknown, damaged or invalid, the scene is open, the trajectory is a rollout of a model, or a setting would change what the
+            archive states.
     """
+    if PREDICTION in names:
+        raise Refusal("is a rollout of a model and no ground truth; leave the file out")
     if wrong := [field.name for field in fields(Facts) if getattr(given, field.name) != getattr(Facts(), field.name)]:
         raise Refusal(f"is an exported trajectory, which states {wrong[0]} itself; leave {wrong[0]} out of the command")
     texts = [name for name in names if name in (*ATTRIBUTES, *FURTHER)]
@@ -53,4 +56,5 @@ def load(path: Path, names: Sequence[str], given: Facts) -> Loaded:
             raise Refusal(str(error).removeprefix(f"{path.name}:trajectory: ").removesuffix(f"; {ADVICE}")) from None
     if trajectory.openings:
         raise Refusal("is an open scene, which cannot be imported")
-    return Loaded(trajectory)
+    what = "its name is that of a rollout of a model, which is no ground truth (evaluation.export); leave the file out if it is one"
+    return Loaded(trajectory, warnings=(what,) if path.name.startswith("rollout_") else ())

@@ -410,6 +410,8 @@ def walls_at_bounds(facts: Facts, dim: int) -> Boundary:
         return Boundary.empty(dim)
     spacing = facts.spacing or (max(high - low for low, high in facts.bounds) / 50)
     sides = [f"{axis}_{side}" for axis in "xyz"[:dim] for side in ("low", "high")]
+    if beyond := [side for side in facts.walls if side not in sides]:
+        raise Refusal(f"has {dim} axes, so there is no wall {beyond[0]}; walls are {', '.join(sides)}")
     walls = domain_walls(facts.bounds, {side: facts.walls.get(side, 0.0) for side in sides})
     named = tuple(wall for wall, side in zip(walls, sides, strict=True) if side in facts.walls)
     return Boundary.sample(named, spacing, dim, facts.periodicity)

@@ -191,7 +191,8 @@ class Flight:
 
 
 def _digest(pos: np.ndarray) -> bytes:
-    """Return a digest of positions [frame, node, dim] that does not depend on the order of the nodes."""
+    """Return a digest of positions [frame, node, dim], in the precision of the store, that does not depend on the order of the nodes."""
+    pos = pos.astype(np.float32)
     order = np.lexsort(pos[[0, -1]].transpose(0, 2, 1).reshape(-1, pos.shape[1]))
     return hashlib.sha256(np.ascontiguousarray(pos[:, order]).tobytes()).digest()
 

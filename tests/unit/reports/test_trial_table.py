@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
 from gpe_pl.files import sealed
 from gpe_pl.reports.finished_runs import finished_runs
+from gpe_pl.reports.stride_table import DIFFERENT_STARTS
 from gpe_pl.reports.trial_table import compares_settings, report_trials
 
 ERRORS = {  # of two seeds, by domain, model and noise
@@ -49,6 +51,26 @@ def test_the_best_setting_of_each_model_is_bold(trials: Path) -> None:
         ["sand", "GPE", "0.3", "2", "–", "3.5 [1, 6]"],
         ["sand", "GPE", "1.0", "1", "–", "**2** [2, 2]"],
     ]
+
+
+def test_repeated_runs_are_no_further_seeds(trials: Path) -> None:
+    report_trials(trials, finished_runs(trials))
+    before = (trials / "trials.md").read_text()
+    shutil.copytree(trials / "sand" / "GPE" / "1.0" / "0", trials / "copy")
+    report_trials(trials, finished_runs(trials))
+    assert (trials / "trials.md").read_text() == before
+
+
+def test_no_setting_is_the_best_of_rollouts_that_start_at_different_times(tmp_path: Path) -> None:
+    for history, error in ((1, 3e-3), (5, 1e-3)):
+        write_run(tmp_path / str(history), "sand", "GPE", 0.3, 0, [error])
+        config = json.loads((tmp_path / str(history) / "config.json").read_text())
+        config |= {"graph": {"history": history}, "data": {"name": "sand", "solver": {"frame_dt": 0.01}}}
+        sealed.write(tmp_path / str(history) / "config.json", {key: value for key, value in config.items() if key != "sha256"})
+    report_trials(tmp_path, finished_runs(tmp_path))
+    text = (tmp_path / "trials.md").read_text()
+    assert DIFFERENT_STARTS.format("0.01 s, 0.05 s") in text
+    assert "| 1 [1, 1] |" in text and "**1**" not in text
 
 
 def test_the_csv_has_a_line_per_run_and_split(trials: Path) -> None:

@@ -17,6 +17,7 @@ from gpe_pl.scenes import design as verb
 from gpe_pl.scenes.design import Design, design
 from gpe_pl.scenes.obstacles import Circle
 from gpe_pl.scenes.scene import Scene
+from gpe_pl.trajectory.trajectory import Termination
 
 RAMP = Polygon(((0.30, 0.35), (0.34, 0.35), (0.34, 0.55), (0.30, 0.55)), 0.3)
 FILE = """
@@ -60,6 +61,18 @@ def test_a_design_has_the_scale_of_its_scene() -> None:
     with pytest.raises(GpeError) as designed:
         design(other, (0.8, 0.1))
     assert str(designed.value) == str(predicted.value)
+
+
+def test_a_rollout_that_stopped_has_no_distance() -> None:
+    seen = scene().predict("sand", 0.02).first
+    goal = np.array([0.5, 0.5])
+    expected = np.sqrt(((seen.pos[-1].astype(np.float64) - goal) ** 2).sum(axis=1).mean())
+    assert verb._distance(seen, goal) == pytest.approx(expected)
+    stopped = replace(seen, termination=Termination("nan", 2, 0, "frame 2"))
+    distances = {"model": (0.5, 0.3), "solver": (0.5, verb._distance(stopped, goal))}
+    text = Design(scene(), (0.0, 0.0, 0.0), distances, {}, "gradient", "", 1, 1, 1.0).summary()
+    assert "solver: distance from the target not known, as the rollout stopped early, 0.5 m at the start" in text
+    assert "keeps" not in text
 
 
 @pytest.mark.slow

@@ -240,6 +240,17 @@ def test_examples_of_the_guide_are_scenes(tmp_path: Path, monkeypatch: pytest.Mo
     assert [scene.state(model("fluid" if scene.zones else "sand"))[0].num_nodes > 100 for scene in shown] == [True, True, True]
 
 
+def test_a_density_that_the_solver_cannot_have_is_refused() -> None:
+    """Its nodes have the volume of their mass at the density of the data, so another mass would be another volume."""
+    light = Scene(box=(1.0, 1.0)).block("elastomer", at=(0.3, 0.3), size=(0.2, 0.2), density=100.0)
+    with pytest.raises(SceneFault, match=r"density: the solver of these data computes with 1000 kg/m³ only"):
+        light.solver_of(model("elastomer"))
+    usual = Scene(box=(1.0, 1.0)).block("elastomer", at=(0.3, 0.3), size=(0.2, 0.2), density=1000.0)
+    assert usual.solver_of(model("elastomer")).name == "mpm"
+    heavy = Scene(box=(1.0, 1.0)).block("solid", at=(0.3, 0.3), size=(0.2, 0.2), density=2000.0)
+    assert heavy.solver_of(model("fem")).name == "fem"  # finite elements have a mass per node
+
+
 @pytest.mark.slow
 def test_a_model_stays_near_the_solver_in_a_scene_of_our_own() -> None:
     film = column(friction_angle=30).obstacle(Circle((0.5, 0.05), 0.05)).compare("sand", seconds=0.2)

@@ -43,6 +43,22 @@ def test_a_slider_predicts_again_with_its_value(monkeypatch: pytest.MonkeyPatch)
     assert "friction angle 25°" in first and "friction angle 40°" in shown(viewer.value)
 
 
+def test_a_slider_also_changes_what_enters(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ipywidgets", reason="ipywidgets is not installed")
+    predicted: list[list[float]] = []
+
+    def predict(self: Scene, model: str, seconds: float) -> Film:
+        predicted.append([body.parameters["friction_angle"] for body in self.filled])
+        return film
+
+    film = block(friction_angle=25).predict("sand", 0.02)
+    monkeypatch.setattr(Scene, "predict", predict)
+    entering = block(friction_angle=25).inlet("sand", "x_low", at=(0.0, 0.5), size=(0.05, 0.2), speed=1.0, friction_angle=25)
+    slider, _, _ = entering.sliders("sand", 0.02).children
+    slider.value = 40.0
+    assert predicted == [[25.0, 25.0], [40.0, 40.0]]
+
+
 def test_without_widgets_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     load = builtins.__import__
 

@@ -252,6 +252,19 @@ def test_normals_point_to_where_nodes_have_been() -> None:
     np.testing.assert_allclose(alone, [[0, 1]])
 
 
+@pytest.mark.parametrize("num_frames", [20, 1000])
+def test_normals_of_slow_scenes_come_from_all_nodes(num_frames: int) -> None:
+    """Every fiftieth of 2500 nodes in 1000 frames would be the same fifty nodes in all frames."""
+    site = (np.arange(50) + 0.5) / 50
+    lattice = np.stack(np.meshgrid(site, site), axis=-1).reshape(-1, 2)
+    visited = lattice + 1e-4 * np.arange(num_frames)[:, None, None] / num_frames
+    zero, one = np.zeros(50), np.ones(50)
+    sides = {(1, 0): (zero, site), (-1, 0): (one, site), (0, 1): (site, zero), (0, -1): (site, one)}
+    for normal, wall in sides.items():
+        estimated = estimated_normals(np.stack(wall, axis=1), visited)
+        assert ((estimated @ np.array(normal, float)) > 0.8).mean() > 0.9
+
+
 def test_the_spacing_of_a_lattice() -> None:
     lattice = 0.1 * np.argwhere(np.ones((10, 5))).astype(np.float64)
     assert typical_spacing(lattice) == pytest.approx(0.1)

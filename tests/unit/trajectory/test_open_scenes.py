@@ -135,6 +135,15 @@ def test_frames_leave_out_nodes_that_are_in_none_of_them(channel: Trajectory) ->
     np.testing.assert_array_equal(channel.frames(4).state(0).pos, channel.state(4).pos)
 
 
+def test_longer_frames_keep_the_places_of_entry_and_exit(channel: Trajectory) -> None:
+    longer = channel.every(3)
+    assert longer.alive is not None and not longer.alive.all()
+    first, last = longer.alive.argmax(axis=0), longer.num_frames - 1 - longer.alive[::-1].argmax(axis=0)
+    for node in range(longer.num_nodes):
+        np.testing.assert_array_equal(longer.pos[: first[node], node], np.broadcast_to(longer.pos[first[node], node], (first[node], 2)))
+        assert (longer.pos[last[node] :, node] == longer.pos[last[node], node]).all()
+
+
 def test_columns_keep_identities_and_the_nearest_values() -> None:
     values, alive, ids = columns(
         [np.array([0, 4]), np.array([4, 5]), np.array([5])], [np.array([1.0, 2.0]), np.array([3.0, 4.0]), np.array([5.0])]

@@ -17,7 +17,7 @@ import pytest
 from gpe_pl.schema import NODE_TYPES, SCHEMA_VERSION
 from gpe_pl.trajectory.state import Stress, von_mises
 from gpe_pl.trajectory.store import StoreError, iter_trajectories, read_metadata, read_trajectory, shards, trajectory_names, write_shard
-from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Termination, Trajectory
 
 New = Callable[..., Trajectory]
 
@@ -325,6 +325,17 @@ def test_state_differences_positions_with_history(trajectory: Trajectory) -> Non
         expected = (trajectory.pos[frame].astype(np.float64) - trajectory.pos[frame - 1].astype(np.float64)) / 0.01
         np.testing.assert_allclose(state.velocity_history[:, k], expected, rtol=1e-14)
     np.testing.assert_array_equal(state.vel, state.velocity_history[:, -1])
+
+
+def test_a_part_knows_when_its_rollout_stopped(trajectory: Trajectory) -> None:
+    stopped = replace(trajectory, termination=Termination("nan", 9, 0, "frame 9"))
+    for part, frame in (
+        (stopped.frames(3), 6),
+        (stopped.frames(2).every(2), 4),
+        (stopped.every(2).frames(1), 4),
+        (stopped.frames(0, 2), 9),
+    ):
+        assert part.termination is not None and part.termination.frame == frame
 
 
 @pytest.mark.parametrize(("frame", "history"), [(-1, 0), (6, 0), (2, 3), (6, 2)])

@@ -5,6 +5,8 @@ import pytest
 from gpe_pl.schema import node_code
 from gpe_pl.trajectory.trajectory import Termination
 from gpe_pl.viz.contact_sheet import contact_sheet
+from gpe_pl.viz.figures import parameter_strip
+from tests.open_scenes import open_trajectory
 
 
 def texts(figure) -> list[str]:
@@ -15,6 +17,18 @@ def with_fewer_nodes(trajectory):
     keep = slice(0, trajectory.num_nodes // 2)
     parts = {name: getattr(trajectory, name)[keep] for name in ("node_type", "mass", "material_params")}
     return replace(trajectory, pos=trajectory.pos[:, keep], vel=trajectory.vel[:, keep], **parts)
+
+
+def test_nodes_that_are_not_in_an_open_scene_are_not_drawn(tmp_path):
+    scene = open_trajectory()
+    assert scene.alive is not None
+    there = scene.alive.sum(axis=1)
+    figure = contact_sheet({"channel": scene}, num_columns=3)
+    frames = [0, (scene.num_frames - 1) // 2, scene.num_frames - 1]
+    shown = [len(axes.collections[0].get_offsets()) for axes in figure.axes]
+    assert shown == [there[frame] for frame in frames] and len(set(shown)) > 1
+    (row, _) = parameter_strip([("30°", scene, scene)], num_columns=3).axes[::3]
+    assert len(row.collections[0].get_offsets()) == there[0]
 
 
 def test_a_row_per_trajectory_and_a_column_per_time(ground_truth, dim):

@@ -56,6 +56,12 @@ def at(panel, image, point) -> np.ndarray:
     return image[image.shape[0] - 1 - int(row), int(column)]
 
 
+def test_a_panel_says_how_many_nodes_it_does_not_show(ground_truth):
+    assert panel_of(ground_truth).note.get_text() == ""
+    gone = replace(ground_truth, pos=ground_truth.pos + np.where(np.arange(ground_truth.num_nodes)[:, None] < 3, -5.0, 0.0))
+    assert panel_of(gone).note.get_text() == f"3 of {ground_truth.num_nodes} nodes are outside"
+
+
 def test_mesh_cells_are_filled_and_only_loose_particles_are_dots(mesh, dim):
     panel = panel_of(mesh)
     loose = np.setdiff1d(np.arange(mesh.num_nodes), mesh.cells)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gpe_pl.export.trajectories import write_vtk
 from gpe_pl.trajectory.state import Stress
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.viewer import FASTEST, ViewerError, write_viewer
@@ -122,6 +123,11 @@ def test_what_does_not_fit_is_refused(tmp_path, ground_truth: Trajectory, mesh):
         ViewerError, match=rf"'GPE' has {fewer.num_nodes} nodes and the ground truth {ground_truth.num_nodes}, or their materials differ"
     ):
         write_viewer(tmp_path / "a.html", ground_truth, {"GPE": fewer})
+    longer = ground_truth.every(2)
+    with pytest.raises(ValueError, match=r"'GPE' has frames of .* s and the ground truth of .* s; take every so many frames of one"):
+        write_viewer(tmp_path / "a.html", ground_truth, {"GPE": longer})
+    with pytest.raises(ValueError, match=r"frames are .* s long, those of the ground truth"):
+        write_vtk(tmp_path / "a.pvd", longer, ground_truth)
     with pytest.raises(ValueError, match=r"a viewer ends in \.html"):
         write_viewer(tmp_path / "a.htm", ground_truth)
     with pytest.raises(ValueError, match="stride must be positive"):

@@ -46,6 +46,18 @@ def test_exported_trajectories_come_back(tmp_path: Path, scenes: list[Trajectory
         assert (after.metadata.bounds, after.metadata.gravity) == (before.metadata.bounds, before.metadata.gravity)
 
 
+def test_rollouts_of_models_are_no_ground_truth(tmp_path: Path, scenes: list[Trajectory]) -> None:
+    """Evaluations write them beside the ground truth, and a holdout would take them as validation and test."""
+    folder = exported(tmp_path / "raw", scenes)
+    write_npz(folder / "rollout_test_00.npz", replace(scenes[0], pos=scenes[0].pos + np.float32(1e-3), is_prediction=True))
+    write_npz(folder / "rollout_test_01.npz", replace(scenes[1], pos=scenes[1].pos + np.float32(1e-3)))  # as earlier versions wrote them
+    report, stored = imported(tmp_path, folder, "arrays", holdout=0.0)
+    (event,) = report.refusals
+    assert str(event).endswith("rollout_test_00.npz: is a rollout of a model and no ground truth; leave the file out")
+    assert len(stored["train"]) == 3
+    assert any("rollout_test_01.npz: its name is that of a rollout of a model" in warning for warning in report.warnings)
+
+
 def refusal(folder: Path, **settings: object) -> str:
     with pytest.raises(ImportFailure) as failure:
         import_dataset(folder.parent / "data", ImportSettings("arrays", str(folder), "set", **settings))  # type: ignore[arg-type]

@@ -30,11 +30,11 @@ def warnings(folder: Path, trajectories: list[dict[str, Any]]) -> list[str]:
     return report(folder, trajectories).warnings
 
 
-def report(folder: Path, trajectories: list[dict[str, Any]]) -> Report:
+def report(folder: Path, trajectories: list[dict[str, Any]], **settings: Any) -> Report:
     (folder / "raw" / "train").mkdir(parents=True)
     for k, arrays in enumerate(trajectories):
         np.savez(folder / "raw" / "train" / f"{k}.npz", **arrays)
-    return imported(folder / "sets", folder / "raw", "arrays")[0]
+    return imported(folder / "sets", folder / "raw", "arrays", **settings)[0]
 
 
 def test_alike_trajectories_are_not_suspects(tmp_path: Path) -> None:
@@ -84,6 +84,17 @@ def test_the_same_scene_with_its_nodes_in_another_order_is_there_twice(tmp_path:
     order = np.random.default_rng(0).permutation(36)
     found = report(tmp_path, [flying(0), flying(1), flying(2), {**again, "pos": again["pos"][:, order]}])
     assert [str(event) for event in found.refusals] == ["train, 3.npz: has exactly the positions of train, 0.npz: the same scene twice"]
+
+
+def test_the_same_scene_in_another_precision_is_there_twice(tmp_path: Path) -> None:
+    again = flying(0)
+    found = report(tmp_path, [flying(0), flying(1), flying(2), {**again, "pos": again["pos"].astype(np.float32).astype(np.float64)}])
+    assert [str(event) for event in found.refusals] == ["train, 3.npz: has exactly the positions of train, 0.npz: the same scene twice"]
+
+
+def test_a_wall_along_an_axis_that_data_lack_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ImportFailure, match="has 2 axes, so there is no wall z_low; walls are x_low, x_high, y_low, y_high"):
+        report(tmp_path, [flying(0), flying(1), flying(2)], walls={"z_low": 0.5})
 
 
 @pytest.mark.parametrize("number", [2**31, 2**32, -(2**33)])
