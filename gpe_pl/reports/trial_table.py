@@ -66,8 +66,8 @@ def report_trials(folder: Path, runs: list[Run]) -> None:
             variants[tuple(str(run.config.get(key)) for key in settings)].append(run)
         error = {v: {s: _error(runs, s) for s in splits} for v, runs in variants.items()}
         best = {s: min(error[v][s] for v in variants) for s in splits}
+        is_compared = len(starts_of(members)) < 2
         for v, runs in sorted(variants.items()):
-            is_compared = len(starts_of(members)) < 2
             cells = [
                 _cell(runs, s, error[v][s], is_best=bool(is_compared and np.isfinite(error[v][s]) and error[v][s] == best[s]))
                 for s in splits

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from gpe_pl.schema import CELL_KINDS
+from gpe_pl.schema import BOUNDARY, CELL_KINDS, node_code
 from gpe_pl.trajectory.cells import kinds_of, stacked
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
@@ -152,8 +152,9 @@ class Panel:
         """Return how many nodes are farther outside the domain than a rest spacing, where the panel does not show them; empty if none is."""
         metadata = self.trajectory.metadata
         low, high = np.asarray(metadata.bounds, float).T
-        beyond = ((pos < low - metadata.spacing) | (pos > high + metadata.spacing)).any(axis=1)
-        return f"{int(beyond.sum())} of {len(pos)} nodes are outside" if beyond.any() else ""
+        moves = self.trajectory.node_type != node_code(BOUNDARY)
+        beyond = ((pos < low - metadata.spacing) | (pos > high + metadata.spacing)).any(axis=1) & moves
+        return f"{int(beyond.sum())} of {int(moves.sum())} nodes are outside" if beyond.any() else ""
 
     def _show(
         self, pos: Float[np.ndarray, "node dim"], node_colors: Float[np.ndarray, "node 4"], cell_colors: Float[np.ndarray, "cell 4"]

@@ -51,7 +51,7 @@ def without_faces(cells: Mapping[str, np.ndarray], num_nodes: int) -> dict[str, 
     found = {}
     for kind, own in cells.items():
         rows = _corners(own, num_nodes)
-        higher = [_corners(c, num_nodes) for k, c in cells.items() if CELL_KINDS[k][0] > CELL_KINDS[kind][0]]
+        higher = [_corners(c, num_nodes) for k, c in cells.items() if CELL_KINDS[k][0] > CELL_KINDS[kind][0] and len(c)]
         is_face = np.zeros(len(own), bool)
         for other in higher:
             is_face |= (rows @ other.T).max(axis=1).toarray().ravel() == own.shape[1]

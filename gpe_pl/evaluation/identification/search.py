@@ -7,7 +7,6 @@ where a simulator is exact. Bounds are bounds of the optimiser; nothing is clamp
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -19,15 +18,11 @@ from pydantic.dataclasses import dataclass as validated_dataclass
 from scipy.optimize import minimize, minimize_scalar
 
 from gpe_pl.evaluation.identification.gradient_check import GradientCheck, Objective, gradient_check
-from gpe_pl.evaluation.identification.valleys import follow_valleys
+from gpe_pl.evaluation.identification.valleys import TOLERANCE, follow_valleys, most_evaluations, ratio
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.system.progress import Progress
 
 GRADIENT, DERIVATIVE_FREE = "gradient", "derivative_free"
-TOLERANCE = 2e-3
-"""Precision of the search, as a fraction of the range between the bounds."""
-LARGEST = 50.0
-"""Largest exponent of the misfit above that of the start."""
 ALL_AT_ONCE = 4
 """From this number of unknowns on, the search starts in the middle, without a scan, and follows no valleys."""
 
@@ -76,7 +71,9 @@ def search(objective: Objective, settings: SearchSettings | None = None, on_prog
     """Return the unknowns with the smallest misfit among all that were tried."""
     s, number = settings or SearchSettings(), len(objective.unknowns)
     tried: list[tuple[np.ndarray, float]] = []
+    follows = bool(s.profile_evaluations) and 1 < number < ALL_AT_ONCE
     total = s.max_evaluations + (s.num_scanned * number if number < ALL_AT_ONCE else 1)
+    total += most_evaluations(number, s.profile_evaluations) if follows else 0
 
     def note(z: np.ndarray, misfit: float) -> float:
         tried.append((np.array(z, dtype=np.float64), misfit))
@@ -92,7 +89,7 @@ def search(objective: Objective, settings: SearchSettings | None = None, on_prog
     base = min(value for _, value in tried)
 
     def relative(z: np.ndarray) -> float:
-        return math.exp(min(misfit(z) - base, LARGEST))
+        return ratio(misfit(z), base)
 
     check = None
     if isinstance(objective.simulator, LearnedSimulator) and (s.method == GRADIENT or (s.method == "auto" and number > 1)):
@@ -102,8 +99,8 @@ def search(objective: Objective, settings: SearchSettings | None = None, on_prog
 
         def with_gradient(z: np.ndarray) -> tuple[float, np.ndarray]:
             value, gradient = objective.misfit_and_gradient(z)
-            ratio = math.exp(min(note(z, value) - base, LARGEST))
-            return ratio, ratio * gradient
+            relative_value = ratio(note(z, value), base)
+            return relative_value, relative_value * gradient
 
         options = {"maxfun": s.max_evaluations, "ftol": 1e-6, "gtol": 1e-4}
         result = minimize(with_gradient, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * number, options=options)
@@ -115,7 +112,7 @@ def search(objective: Objective, settings: SearchSettings | None = None, on_prog
         options = {"initial_tr_radius": width, "final_tr_radius": TOLERANCE, "maxfev": s.max_evaluations}
         result = minimize(relative, start, method="COBYQA", bounds=[(0.0, 1.0)] * number, options=options)
     is_unfinished = not result.success and len(tried) - num_scanned >= s.max_evaluations
-    if s.profile_evaluations and 1 < number < ALL_AT_ONCE:
+    if follows:
         follow_valleys(misfit, tried, s.profile_evaluations)
     z, least = min(tried, key=lambda pair: pair[1])
     return Found(np.clip(z, 0.0, 1.0), least, method, check, tried, is_unfinished)

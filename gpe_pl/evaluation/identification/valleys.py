@@ -22,13 +22,25 @@ FOLLOWED = 0.5
 """Misfit above the smallest up to which valleys are followed."""
 NUM_STEPS = 6
 """Largest number of steps to each side; each is twice as long as the one before."""
-RADIUS, FINEST = 0.06, 2e-3
-"""First and last radius of the searches of the other unknowns, as a fraction of the range between the bounds."""
+RADIUS = 0.06
+"""First radius of the searches of the other unknowns, as a fraction of the range between the bounds."""
+TOLERANCE = 2e-3
+"""Precision of searches, as a fraction of the range between the bounds."""
 LARGEST = 50.0
-"""Largest exponent of the misfit above the smallest."""
+"""Largest exponent of the misfit above another one."""
 
 Tried = list[tuple[np.ndarray, float]]
 """Numbers from 0 to 1 and misfit of each evaluation."""
+
+
+def ratio(misfit: float, base: float) -> float:
+    """Return the exponential of a misfit above another one: a geometric mean of squared displacements over that of another."""
+    return math.exp(min(misfit - base, LARGEST))
+
+
+def most_evaluations(number: int, evaluations: int) -> int:
+    """Return the largest number of evaluations of ``follow_valleys`` for so many unknowns."""
+    return 2 * number * NUM_STEPS * evaluations
 
 
 def follow_valleys(misfit: Callable[[np.ndarray], float], tried: Tried, evaluations: int) -> None:
@@ -47,7 +59,7 @@ def follow_valleys(misfit: Callable[[np.ndarray], float], tried: Tried, evaluati
 def _follow(misfit: Callable[[np.ndarray], float], tried: Tried, k: int, side: int, evaluations: int) -> None:
     answer, _ = _best(tried)
     known = Profile.of(((float(z[k]), value) for z, value in tried), (0.0, 1.0))
-    step = max(abs(known.within(FOLLOWED)[max(side, 0)] - answer[k]), FINEST)
+    step = max(abs(known.within(FOLLOWED)[max(side, 0)] - answer[k]), TOLERANCE)
     at = answer
     for _ in range(NUM_STEPS):
         value = float(np.clip(at[k] + side * step, 0.0, 1.0))
@@ -67,9 +79,9 @@ def _searched(misfit: Callable[[np.ndarray], float], tried: Tried, start: np.nda
     def relative(own: Float64[np.ndarray, "other"]) -> float:
         z = start.copy()
         z[others] = np.clip(own, 0.0, 1.0)
-        return math.exp(min(misfit(z) - base, LARGEST))
+        return ratio(misfit(z), base)
 
-    options = {"initial_tr_radius": RADIUS, "final_tr_radius": FINEST, "maxfev": evaluations}
+    options = {"initial_tr_radius": RADIUS, "final_tr_radius": TOLERANCE, "maxfev": evaluations}
     minimize(relative, start[others], method="COBYQA", bounds=[(0.0, 1.0)] * int(others.sum()), options=options)
     return _best(tried[before:])
 

@@ -16,13 +16,18 @@ from gpe_pl.evaluation.calibration import Calibration, CalibrationError
 from gpe_pl.evaluation.coverage import Coverage
 from gpe_pl.evaluation.metric_rows import LEARNED, Row
 from gpe_pl.evaluation.predictions import PredictedScene
+from gpe_pl.evaluation.settings import EvaluationSettings
+from gpe_pl.evaluation.uncertainty import Uncertainty, _other_settings
 from gpe_pl.files.sealed import SealError
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned import bands
 from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.banded import roll_out_with_bands
 from gpe_pl.learned.bands import Bands
 from gpe_pl.learned.ensemble import LearnedEnsemble
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.rollout.skips import Skips
@@ -229,3 +234,24 @@ def test_bands_of_other_frames_are_refused_and_of_other_levels_marked(checkpoint
     expected = rollout(Contained(approximate(single), metadata().frame_dt), start, 4, metadata())
     np.testing.assert_array_equal(repeated.trajectory.pos, expected.pos)
     assert np.abs(repeated.trajectory.pos - exact.trajectory.pos).max() > 0
+
+
+def test_the_settings_of_a_rollout_are_those_that_differ_from_the_model(checkpoint: Path) -> None:
+    simulator = LearnedSimulator.from_checkpoint(checkpoint)
+    assert _other_settings(EvaluationSettings(), simulator) == {}
+    assert _other_settings(EvaluationSettings(mirror_average=False, static_friction=simulator.static_friction), simulator) == {}
+    simulator.skips = Skips(repeat_frames=3)
+    given = EvaluationSettings(mirror_average=True, clamp_parameters=False)
+    assert _other_settings(given, simulator) == {
+        "evaluation.mirror_average": True, "evaluation.clamp_parameters": False, "rollout.repeat_frames": 3,
+    }  # fmt: skip
+
+
+def test_a_model_at_another_scale_has_the_horizons_of_its_scene(tmp_path: Path) -> None:
+    builder = GraphBuilder(GraphConfig(history=1, scales="dimensionless"), metadata())
+    simulator = LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder)
+    simulator.save(tmp_path / "own.ckpt")
+    for factor, frame in ((1.0, 20), (2.0, 10)):
+        here = simulator.at(frame_dt=factor * metadata().frame_dt)
+        seen = Uncertainty([str(tmp_path / "own.ckpt")], here, EvaluationSettings(horizons=[0.1]), "test", "abc")
+        assert [*seen.horizons] == [frame]

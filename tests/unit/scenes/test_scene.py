@@ -14,10 +14,15 @@ from PIL import Image
 
 from gpe_pl.geometry.sections import section, solid_within
 from gpe_pl.geometry.shapes import Box
+from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.loop import rollout
+from gpe_pl.rollout.skips import Skips
 from gpe_pl.scenes import predict
 from gpe_pl.scenes.film import Film
 from gpe_pl.scenes.obstacles import Circle
+from gpe_pl.scenes.rollouts import predicted
 from gpe_pl.scenes.scene import Scene, SceneFault
 from gpe_pl.scenes.scene_file import read_scene
 from gpe_pl.schema import node_code
@@ -238,6 +243,17 @@ def test_examples_of_the_guide_are_scenes(tmp_path: Path, monkeypatch: pytest.Mo
         for code in (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Scene(" in block):
             exec(code, names)
     assert [scene.state(model("fluid" if scene.zones else "sand"))[0].num_nodes > 100 for scene in shown] == [True, True, True]
+
+
+def test_a_prediction_has_the_approximate_levels_of_the_model() -> None:
+    own = LearnedSimulator.from_checkpoint("sand")  # its settings change
+    state, metadata = column(friction_angle=30).state(own)
+    exact = predicted(own, state, metadata, 4, "exact")
+    own.skips = Skips(repeat_frames=4)
+    repeated = predicted(own, state, metadata, 4, "repeated")
+    expected = rollout(Contained(approximate(own), metadata.frame_dt), own.standing(state, metadata), 4, metadata)
+    np.testing.assert_allclose(repeated.pos, expected.pos, atol=1e-9)
+    assert np.abs(repeated.pos - exact.pos).max() > 1e-9
 
 
 def test_a_density_that_the_solver_cannot_have_is_refused() -> None:

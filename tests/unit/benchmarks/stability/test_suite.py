@@ -352,6 +352,17 @@ def test_two_checkpoints_of_one_name_are_an_error(spec: DatasetSpec, scenes: lis
         run(settings, {"sand": spec}, tmp_path / "results")
 
 
+def test_a_checkpoint_that_fits_no_data_set_is_named(
+    spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    subject(spec, scenes, **SHIPPED).simulator.save(tmp_path / "own.ckpt")
+    monkeypatch.setattr(suite, "_outcome", lambda *_: Outcome(True, "as it should be"))
+    settings = Settings({"sand": Case([])}, [], [str(tmp_path / "own.ckpt"), "snow"], SHIPPED, 1, [1.0], 5, [1])
+    _, table = run(settings, {"sand": spec}, tmp_path / "results")
+    assert "Checkpoints that were not tested, because they were trained on none of these data sets: snow." in table
+    assert "snow: not tested" in caplog.text
+
+
 def test_a_run_that_finishes_during_the_suite_takes_no_part(
     spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -215,6 +215,8 @@ def test_only_cells_that_belong_to_a_larger_one_are_left_out() -> None:
     assert {kind: own.tolist() for kind, own in found.items()} == {
         "hexahedron": cells["hexahedron"].tolist(), "triangle": [[4, 6, 7]], "line": [[8, 9]],
     }  # fmt: skip
+    nothing = {"tetrahedron": np.zeros((0, 4), int), "triangle": np.array([[0, 1, 2]])}
+    assert without_faces(nothing, 3)["triangle"].tolist() == [[0, 1, 2]]
     assert without_faces({"tetrahedron": CELLS, "triangle": CELLS[:, :3]}, 12).keys() == {"tetrahedron"}
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.evaluation import rollout_scores as rollout_scores_module
 from gpe_pl.evaluation.identification.answer import Answer, AnswerError, known_of, read_answers, side_by_side
 from gpe_pl.evaluation.identification.calibration import FewScenesError, Known, calibrated, cross_calibrated
@@ -25,6 +26,7 @@ from gpe_pl.evaluation.identification.shooting import Shooting, ShootingError, S
 from gpe_pl.evaluation.identification.unknowns import UnknownError, unknowns_of
 from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.files import sealed
+from gpe_pl.identify import Settings, _calibrations, _identity
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.conformal import interval_score
 from gpe_pl.models.gpe import GPE
@@ -33,6 +35,7 @@ from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests import scenes
 from tests.drag import ANGLE, BOUNDS, DT, Drag, thrown
+from tests.runs import compose
 from tests.unit.training.test_unroll_gradients import Double, simulator_of, slow, unroll
 
 
@@ -419,6 +422,25 @@ def test_an_answer_of_another_version_is_refused(tmp_path: Path) -> None:
     sealed.write(path, found)
     with pytest.raises(AnswerError, match=r"first_solver\.json: is an answer of another version; delete the file"):
         read_answers(tmp_path, "solver")
+
+
+@pytest.mark.parametrize(
+    ("there", "name"),
+    [({"unknowns": ["sand", "velocity"]}, "unknowns"), ({"bounds": {"sand.friction_angle": [10.0, 50.0]}}, "bounds"), ({"checkpoint": "x"}, "checkpoint")],
+)  # fmt: skip
+def test_a_calibration_of_another_search_is_refused(tmp_path: Path, there: dict[str, Any], name: str) -> None:
+    """Its threshold and line hold for its own unknowns, bounds and model only, also for answers of the solver."""
+    cfg = compose("identify", "checkpoint=sand", "trajectory=scenes", "simulator=solver", f"calibration={tmp_path}")
+    settings = Settings("sand", "scenes", simulator="solver", calibration=str(tmp_path))
+    for k in range(9):
+        answer = identify(Drag(), thrown(25.0 + k), bounds=BOUNDS, scene=f"scene{k}")
+        answer.write(tmp_path)
+    sealed.write(tmp_path / "config.json", _identity(cfg))
+    found, known = _calibrations(cfg, settings)
+    assert found.keys() == {"solver"} and len(known) == 9
+    sealed.write(tmp_path / "config.json", {**_identity(cfg), **there})
+    with pytest.raises(ConfigError, match=f"was made with other settings .{name}: "):
+        _calibrations(cfg, settings)
 
 
 def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -129,6 +129,9 @@ def test_intervals_follow_valleys_of_the_misfit(number: int) -> None:
         assert low < 0.05 and high > 0.95
         low, high = interval(0, k)
         assert high - low < 0.2
+    planned: list[tuple[int, int]] = []
+    search(Valley(number), on_progress=lambda done, total: planned.append((done, total)))
+    assert len(planned) > 100 and [done for done, _ in planned] == [*range(1, len(planned) + 1)], "the bar moves to the end"
     if number == 3:  # the third is well known
         low, high = interval(12, 2)
         assert 0.3 < low < 0.4 < high < 0.5
