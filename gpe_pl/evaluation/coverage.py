@@ -25,7 +25,7 @@ GUARANTEES: tuple[Guarantee, ...] = ("nodes", "scene")
 
 @dataclass(frozen=True)
 class SceneCoverage:
-    """Coverage of one scene. Nodes are those that errors are about (``metrics.compared``).
+    """Coverage of one scene. Only the nodes count that ``metrics.compared`` returns.
 
     Attributes:
         group: split, and group of unseen material parameters.

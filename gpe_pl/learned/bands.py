@@ -7,8 +7,8 @@ guarantees for a new scene that is exchangeable with the calibration scenes, in 
 - ``nodes``: the expected fraction of the scene's nodes inside their bands is at least the level.
 - ``scene``: with a probability of at least the level, at least this fraction of the scene's nodes is inside. These bands are wider.
 
-The scene's nodes in a frame are those that errors are about (``metrics.compared``): nodes whose motion is given do not count, and neither do nodes that are
-not in an open scene. A frame without such nodes is covered.
+Nodes whose motion is given do not count, and neither do nodes that are not in an open scene at the frame (``metrics.compared``). A frame in which no node
+counts is covered.
 
 Both hold on average over calibration sets, for one frame at a time and not for all frames at once. They do not hold for scenes unlike the calibration scenes.
 

@@ -112,7 +112,7 @@ def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.
 
 
 def compared(prediction: Trajectory, ground_truth: Trajectory) -> Bool[np.ndarray, "frame node"]:
-    """Return which nodes the errors of each frame of the ground truth are about: those whose motion is not given along all axes.
+    """Return which nodes count in the errors of each frame of the ground truth: those whose motion is not given along all axes.
 
     In open scenes, these are the nodes that are in either rollout at the frame, without those that never enter one of the two.
     """

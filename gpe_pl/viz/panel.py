@@ -139,9 +139,10 @@ class Panel:
         if frame < self.trajectory.num_frames:
             pos = self.trajectory.metadata.periodicity.wrapped(self.trajectory.pos[frame].astype(np.float64))
             self._show(pos, *self.coloring(self.trajectory, frame))
-            self.note.set_text(self._outside(pos))
+            self.note.set(text=self._outside(pos), y=0.85)  # above most of the motion
             return
         self._show(np.full(self.trajectory.pos.shape[1:], np.nan), *self.coloring(self.trajectory, 0))
+        self.note.set_y(0.5)
         stop = self.trajectory.termination
         if stop is None:
             self.note.set_text("not simulated")
@@ -154,7 +155,7 @@ class Panel:
         low, high = np.asarray(metadata.bounds, float).T
         moves = self.trajectory.node_type != node_code(BOUNDARY)
         beyond = ((pos < low - metadata.spacing) | (pos > high + metadata.spacing)).any(axis=1) & moves
-        return f"{int(beyond.sum())} of {int(moves.sum())} nodes are outside" if beyond.any() else ""
+        return f"{int(beyond.sum())} of {int(moves.sum())} nodes\nare outside" if beyond.any() else ""
 
     def _show(
         self, pos: Float[np.ndarray, "node dim"], node_colors: Float[np.ndarray, "node 4"], cell_colors: Float[np.ndarray, "cell 4"]

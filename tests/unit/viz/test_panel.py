@@ -59,7 +59,7 @@ def at(panel, image, point) -> np.ndarray:
 def test_a_panel_says_how_many_nodes_it_does_not_show(ground_truth):
     assert panel_of(ground_truth).note.get_text() == ""
     gone = replace(ground_truth, pos=ground_truth.pos + np.where(np.arange(ground_truth.num_nodes)[:, None] < 3, -5.0, 0.0))
-    assert panel_of(gone).note.get_text() == f"3 of {ground_truth.num_nodes} nodes are outside"
+    assert panel_of(gone).note.get_text() == f"3 of {ground_truth.num_nodes} nodes\nare outside"
 
 
 def test_mesh_cells_are_filled_and_only_loose_particles_are_dots(mesh, dim):
