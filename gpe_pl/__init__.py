@@ -8,8 +8,8 @@ Import the most common names from here. This example compares a trained model wi
     prediction = roll_out(simulator, simulator.initial_state(truth, frame=5), num_steps=100, metadata=truth.metadata)
     rollout_figure(truth.frames(5, 106), {"GPE": prediction}).savefig("rollout.png")
 
-A name is imported when it is first used, so a program imports only what it needs. ``roll_out`` is the function ``rollout.loop.rollout``; it has another name
-here because ``gpe_pl.rollout`` is a package.
+A name is imported when it is first used, so a program imports only what it needs. No name is that of a module, whose import would replace it:
+``roll_out`` is the function ``rollout.loop.rollout``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from gpe_pl.data.ground_truth import generate_trajectory as generate_trajectory
     from gpe_pl.data.importers.assemble import save_dataset as save_dataset
     from gpe_pl.errors import GpeError as GpeError
-    from gpe_pl.evaluation.identification.scene import identify as identify
+    from gpe_pl.evaluation.identification.scene import identify_parameters as identify_parameters
     from gpe_pl.export.program import export_model as export_model
     from gpe_pl.export.trajectories import write_npz as write_npz
     from gpe_pl.export.trajectories import write_vtk as write_vtk
@@ -72,7 +72,7 @@ _MODULES = {
     "domain_walls": "geometry.shapes",
     "export_model": "export.program",
     "generate_trajectory": "data.ground_truth",
-    "identify": "evaluation.identification.scene",
+    "identify_parameters": "evaluation.identification.scene",
     "iter_trajectories": "trajectory.store",
     "read_bands": "learned.bands",
     "read_trajectory": "trajectory.store",

@@ -109,6 +109,7 @@ def test_every_public_name_is_there_and_known_to_type_checkers() -> None:
     for name, place in imported.items():
         value = getattr(gpe_pl, name)
         assert f"{value.__module__}.{value.__qualname__}" == place
+    assert not {path.stem for path in (ROOT / "gpe_pl").iterdir()} & set(imported)  # importing such a module would replace the name
     with pytest.raises(AttributeError, match="has no attribute 'Simulator'; it has Boundary, Circle, Contained, "):
         _ = gpe_pl.Simulator
 

@@ -26,7 +26,7 @@ from gpe_pl.evaluation.identification.answer import (
 from gpe_pl.evaluation.identification.calibration import Calibration, cross_calibrated
 from gpe_pl.evaluation.identification.observations import ObservationError, Observations, ObservationSettings
 from gpe_pl.evaluation.identification.pictures import misfit_figure
-from gpe_pl.evaluation.identification.scene import SolverError, identify, solver_bounds, solver_of, trained_bounds
+from gpe_pl.evaluation.identification.scene import SolverError, identify_parameters, solver_bounds, solver_of, trained_bounds
 from gpe_pl.evaluation.identification.search import SearchSettings
 from gpe_pl.evaluation.identification.shooting import ShootingSettings
 from gpe_pl.evaluation.identification.unknowns import Bounds, Unknowns, unknowns_of
@@ -50,7 +50,7 @@ class Task:
 
     Attributes:
         model: trained model, which also gives the bounds.
-        unknowns, per_body, bounds: as in ``identify``.
+        unknowns, per_body, bounds: as in ``identify_parameters``.
         simulators: ``model``, ``solver``, or both.
         observations, shooting, search: settings.
         calibrations: calibration by simulator and name of the unknown.
@@ -88,7 +88,7 @@ class Task:
                     yield str(error)
                     continue
                 with progress_bar(f"{name} {kind}") as on_progress:
-                    answer = identify(
+                    answer = identify_parameters(
                         simulator, observed, self.unknowns, per_body=self.per_body, bounds=bounds, shooting_settings=self.shooting,
                         search_settings=self.search, calibration=self.calibrations.get(kind), scene=name, on_progress=on_progress,
                     )  # fmt: skip

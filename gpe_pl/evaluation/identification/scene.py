@@ -1,4 +1,4 @@
-"""``identify``: the unknowns of one scene from its observed motion."""
+"""``identify_parameters``: the unknowns of one scene from its observed motion."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class SolverError(GpeError, ValueError):
     """Raised when the bundled solver of a trajectory cannot be rebuilt."""
 
 
-def identify(
+def identify_parameters(
     simulator: LearnedSimulator | Simulator,
     observed: Trajectory | Observations,
     unknowns: Sequence[str] | None = None,
@@ -51,7 +51,7 @@ def identify(
     Stored values of the unknowns are not used. Other parameters, the obstacles and the masses have to be right::
 
         simulator = LearnedSimulator.from_checkpoint("sand")
-        print(identify(simulator, trajectory))  # friction angle of sand 31.2° (90 %: 30.1–32.4)
+        print(identify_parameters(simulator, trajectory))  # friction angle of sand 31.2° (90 %: 30.1–32.4)
 
     Args:
         simulator: trained model, or a solver.

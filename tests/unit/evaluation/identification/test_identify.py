@@ -20,7 +20,7 @@ from gpe_pl.evaluation.identification.gradient_check import GradientCheck, gradi
 from gpe_pl.evaluation.identification.observations import ObservationError, Observations, ObservationSettings
 from gpe_pl.evaluation.identification.profile import Profile
 from gpe_pl.evaluation.identification.results import Task, write_table
-from gpe_pl.evaluation.identification.scene import SolverError, identify, solver_of
+from gpe_pl.evaluation.identification.scene import SolverError, identify_parameters, solver_of
 from gpe_pl.evaluation.identification.search import SearchSettings
 from gpe_pl.evaluation.identification.shooting import Shooting, ShootingError, ShootingSettings, shooting
 from gpe_pl.evaluation.identification.unknowns import UnknownError, unknowns_of
@@ -42,7 +42,7 @@ from tests.unit.training.test_unroll_gradients import Double, simulator_of, slow
 def test_a_parameter_is_found_whatever_is_stored() -> None:
     seen = thrown()
     hidden = replace(seen, material_params=np.full_like(seen.material_params, 25.0))
-    answer = identify(Drag(), hidden, bounds=BOUNDS)
+    answer = identify_parameters(Drag(), hidden, bounds=BOUNDS)
     assert answer["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=0.1)
     assert answer["sand.friction_angle"].truth == 25.0
     assert answer.num_windows == 2
@@ -52,13 +52,13 @@ def test_a_parameter_is_found_whatever_is_stored() -> None:
 
 def test_logarithmic_parameters_are_found() -> None:
     simulator = Drag(rate=20.0)
-    answer = identify(simulator, thrown(0.03, "fluid", simulator), bounds=BOUNDS)
+    answer = identify_parameters(simulator, thrown(0.03, "fluid", simulator), bounds=BOUNDS)
     assert answer.values[0].estimate == pytest.approx(0.03, rel=0.02)
 
 
 def test_bodies_have_values_of_their_own() -> None:
     values = np.repeat([24.0, 38.0], 9)
-    answer = identify(Drag(), thrown(values), per_body=True, bounds=BOUNDS, search_settings=SearchSettings(max_evaluations=100))
+    answer = identify_parameters(Drag(), thrown(values), per_body=True, bounds=BOUNDS, search_settings=SearchSettings(max_evaluations=100))
     assert [value.estimate for value in answer.values] == pytest.approx([24.0, 38.0], abs=0.5)
     assert [value.truth for value in answer.values] == [24.0, 38.0]
 
@@ -71,10 +71,10 @@ def test_motion_of_the_scene_is_found_too(wanted: list[str]) -> None:
         down = np.array([math.tan(math.radians(10.0)), -1.0])
         tilted = replace(seen.metadata, gravity=tuple(9.81 * down / np.linalg.norm(down)))
         moved = rollout(Drag(), replace(seen.state(0), gravity=np.array(tilted.gravity)), 39, seen.metadata)
-        answer = identify(Drag(), moved, wanted, bounds=BOUNDS, search_settings=settings)
+        answer = identify_parameters(Drag(), moved, wanted, bounds=BOUNDS, search_settings=settings)
         assert answer["gravity.x"].estimate == pytest.approx(10.0, abs=1.0)
     else:
-        answer = identify(Drag(), seen, wanted, bounds=BOUNDS, search_settings=settings)
+        answer = identify_parameters(Drag(), seen, wanted, bounds=BOUNDS, search_settings=settings)
         assert [answer[f"velocity.{axis}"].estimate for axis in "xy"] == pytest.approx([1.0, 0.5], abs=0.05)
         assert answer.num_windows == 1
     assert answer["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=2.0)
@@ -82,13 +82,13 @@ def test_motion_of_the_scene_is_found_too(wanted: list[str]) -> None:
 
 def test_a_search_that_was_cut_short_says_so() -> None:
     few = SearchSettings(num_scanned=3, max_evaluations=2)
-    answer = identify(Drag(), thrown(), bounds=BOUNDS, search_settings=few)
+    answer = identify_parameters(Drag(), thrown(), bounds=BOUNDS, search_settings=few)
     assert answer.is_unfinished and "stopped at search.max_evaluations" in str(answer)
-    assert not identify(Drag(), thrown(), bounds=BOUNDS).is_unfinished
+    assert not identify_parameters(Drag(), thrown(), bounds=BOUNDS).is_unfinished
 
 
 def test_an_answer_at_a_bound_says_so() -> None:
-    answer = identify(Drag(), thrown(45.0), bounds=BOUNDS)
+    answer = identify_parameters(Drag(), thrown(45.0), bounds=BOUNDS)
     assert answer.values[0].at_bound == "upper"
     assert "model at the upper bound" not in side_by_side({"solver": answer})[0]
     assert "solver at the upper bound" in side_by_side({"solver": answer})[0]
@@ -102,7 +102,7 @@ def test_rollouts_that_fail_do_not_win() -> None:
                 raise SimulationError("too soft")
             return super().step(state)
 
-    assert identify(Fails(), thrown(32.0), bounds=BOUNDS).values[0].estimate == pytest.approx(32.0, abs=0.2)
+    assert identify_parameters(Fails(), thrown(32.0), bounds=BOUNDS).values[0].estimate == pytest.approx(32.0, abs=0.2)
 
 
 @pytest.mark.parametrize(
@@ -119,12 +119,12 @@ def test_unknowns_and_bounds_without_meaning_are_refused(
     wanted: list[str] | None, bounds: dict[str, tuple[float, float]], message: str
 ) -> None:
     with pytest.raises(UnknownError, match=message):
-        identify(Drag(), thrown(), wanted, bounds=bounds)
+        identify_parameters(Drag(), thrown(), wanted, bounds=bounds)
 
 
 def test_a_logarithmic_parameter_needs_positive_bounds() -> None:
     with pytest.raises(UnknownError, match=r"\[0, 0\.5\]: must be positive and finite"):
-        identify(Drag(), thrown(0.03, "fluid"), bounds={"fluid.kinematic_viscosity": (0.0, 0.5)})
+        identify_parameters(Drag(), thrown(0.03, "fluid"), bounds={"fluid.kinematic_viscosity": (0.0, 0.5)})
 
 
 def test_a_scene_in_which_every_rollout_fails_has_no_answer() -> None:
@@ -134,15 +134,15 @@ def test_a_scene_in_which_every_rollout_fails_has_no_answer() -> None:
             raise SimulationError("failed")
 
     with pytest.raises(ShootingError, match="first: every rollout failed, with all"):
-        identify(Fails(), thrown(), bounds=BOUNDS, scene="first")
+        identify_parameters(Fails(), thrown(), bounds=BOUNDS, scene="first")
 
 
 def test_an_answer_that_does_not_fit_says_so() -> None:
     seen = thrown()
-    answer = identify(Drag(), replace(seen, pos=10 * seen.pos), bounds=BOUNDS)
+    answer = identify_parameters(Drag(), replace(seen, pos=10 * seen.pos), bounds=BOUNDS)
     assert "solver does not fit: its rollouts are" in str(answer)
     assert any("solver does not fit" in line for line in side_by_side({"solver": answer}))
-    assert not identify(Drag(), seen, bounds=BOUNDS).warning
+    assert not identify_parameters(Drag(), seen, bounds=BOUNDS).warning
 
 
 @dataclass(frozen=True)
@@ -157,23 +157,23 @@ class Recorded(Drag):
 
 def test_a_solver_with_other_frames_than_the_motion_is_refused() -> None:
     seen = thrown()
-    assert identify(Recorded(), seen, bounds=BOUNDS)["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=0.1)
+    assert identify_parameters(Recorded(), seen, bounds=BOUNDS)["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=0.1)
     with pytest.raises(ShootingError, match=r"the solver drag has frame_dt = 0.01 s, the scene 0.02 s"):
-        identify(Recorded(), seen.every(2), bounds=BOUNDS)
+        identify_parameters(Recorded(), seen.every(2), bounds=BOUNDS)
 
 
 def test_refusals() -> None:
     seen = thrown()
     with pytest.raises(UnknownError, match=r"'snow' is no material of the scene; it has sand"):
-        identify(Drag(), seen, ["snow"], bounds=BOUNDS)
+        identify_parameters(Drag(), seen, ["snow"], bounds=BOUNDS)
     with pytest.raises(UnknownError, match=r"no stored parameter 'cohesion'; it has friction_angle"):
-        identify(Drag(), seen, ["sand.cohesion"], bounds=BOUNDS)
+        identify_parameters(Drag(), seen, ["sand.cohesion"], bounds=BOUNDS)
     with pytest.raises(UnknownError, match=r"give one with bounds='\{sand\.friction_angle:\[LOW,HIGH\]\}'"):
-        identify(Drag(), seen)
+        identify_parameters(Drag(), seen)
     with pytest.raises(ObservationError, match="fewer than 2 frames"):
         Observations(seen, np.zeros(seen.pos.shape[:2], dtype=bool))
     with pytest.raises(ShootingError, match="needs the start; choose simulator=model"):
-        identify(Drag(can_restart=False), replace(seen, start_time=1.0), bounds=BOUNDS)
+        identify_parameters(Drag(can_restart=False), replace(seen, start_time=1.0), bounds=BOUNDS)
     with pytest.raises(ShootingError, match="solvers have no gradients"):
         shooting(Drag(), Observations.of(seen), unknowns_of(seen, None, BOUNDS)).misfit_and_gradient([0.5])
     with pytest.raises(SolverError, match="not from one that comes with the package"):
@@ -296,11 +296,11 @@ def test_a_search_without_trusted_gradients_goes_on_without(monkeypatch: pytest.
     trusted = gradient_check(gradients_of(simulator, seen), [0.7])
     settings = {"shooting_settings": ShootingSettings(horizon=2, num_windows=2), "bounds": {"sand.friction_angle": (1.0, 60.0)}}
     search = SearchSettings(method="gradient", num_scanned=3, max_evaluations=6)
-    answer = identify(simulator, seen, search_settings=search, **settings)  # type: ignore[arg-type]
+    answer = identify_parameters(simulator, seen, search_settings=search, **settings)  # type: ignore[arg-type]
     assert (answer.method == "gradient") == ("are trusted" in answer.gradients)
     assert trusted.is_trusted
     monkeypatch.setattr(GradientCheck, "is_trusted", False)
-    answer = identify(simulator, seen, search_settings=search, **settings)  # type: ignore[arg-type]
+    answer = identify_parameters(simulator, seen, search_settings=search, **settings)  # type: ignore[arg-type]
     assert answer.method == "derivative_free"
     assert "derivative-free search takes their place" in answer.gradients
 
@@ -401,7 +401,7 @@ def test_intervals_do_not_depend_on_the_truth_of_their_own_part() -> None:
 
 
 def test_answers_are_read_as_they_were_written(tmp_path: Path) -> None:
-    answer: Answer = identify(Drag(), thrown(), bounds=BOUNDS, scene="first")
+    answer: Answer = identify_parameters(Drag(), thrown(), bounds=BOUNDS, scene="first")
     answer.write(tmp_path)
     assert read_answers(tmp_path, "solver") == [answer]
     older = sealed.read(path := tmp_path / "scenes" / "first_solver.json", "")
@@ -415,7 +415,7 @@ def test_answers_are_read_as_they_were_written(tmp_path: Path) -> None:
 
 
 def test_an_answer_of_another_version_is_refused(tmp_path: Path) -> None:
-    identify(Drag(), thrown(), bounds=BOUNDS, scene="first").write(tmp_path)
+    identify_parameters(Drag(), thrown(), bounds=BOUNDS, scene="first").write(tmp_path)
     path = tmp_path / "scenes" / "first_solver.json"
     found = sealed.read(path, "")
     found["values"][0]["scale"] = 1.0
@@ -433,7 +433,7 @@ def test_a_calibration_of_another_search_is_refused(tmp_path: Path, there: dict[
     cfg = compose("identify", "checkpoint=sand", "trajectory=scenes", "simulator=solver", f"calibration={tmp_path}")
     settings = Settings("sand", "scenes", simulator="solver", calibration=str(tmp_path))
     for k in range(9):
-        answer = identify(Drag(), thrown(25.0 + k), bounds=BOUNDS, scene=f"scene{k}")
+        answer = identify_parameters(Drag(), thrown(25.0 + k), bounds=BOUNDS, scene=f"scene{k}")
         answer.write(tmp_path)
     sealed.write(tmp_path / "config.json", _identity(cfg))
     found, known = _calibrations(cfg, settings)
@@ -455,7 +455,7 @@ def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.Monke
     assert ", solver " in line
     assert {path.name for path in (tmp_path / "scenes").glob("*.png")} == {"first_misfit.png", "first_motion.png"}
     before = read_answers(tmp_path, "model")
-    monkeypatch.setattr("gpe_pl.evaluation.identification.results.identify", None)
+    monkeypatch.setattr("gpe_pl.evaluation.identification.results.identify_parameters", None)
     assert [*task.run("first", seen, tmp_path)] == [line]
     assert read_answers(tmp_path, "model") == before
     with pytest.raises(ObservationError, match=r"first_model\.json: is the answer for another motion than that of first"):
@@ -468,7 +468,7 @@ def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize(("number", "others"), [(11, "other scenes"), (18, "the other half")])
 def test_the_table_says_what_calibration_gives(tmp_path: Path, number: int, others: str) -> None:
-    answer = identify(Drag(rate=0.11), thrown(31.0), bounds=BOUNDS)  # too low by a tenth
+    answer = identify_parameters(Drag(rate=0.11), thrown(31.0), bounds=BOUNDS)  # too low by a tenth
     for k in range(number):
         replace(answer, scene=f"{k:02d}").write(tmp_path)
     rows = [line.strip("| ").split(" | ") for line in write_table(tmp_path).splitlines()[2:]]

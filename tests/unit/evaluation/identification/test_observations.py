@@ -11,7 +11,7 @@ import pytest
 
 from gpe_pl.evaluation.identification.observations import ObservationError, Observations, ObservationSettings
 from gpe_pl.evaluation.identification.profile import Profile
-from gpe_pl.evaluation.identification.scene import identify
+from gpe_pl.evaluation.identification.scene import identify_parameters
 from gpe_pl.evaluation.identification.search import SearchSettings, search
 from gpe_pl.evaluation.identification.shooting import ShootingError, ShootingSettings, shooting
 from gpe_pl.evaluation.identification.unknowns import Unknowns, scene_bodies, unknowns_of
@@ -21,7 +21,7 @@ from tests.drag import ANGLE, BOUNDS, Drag, thrown
 @pytest.mark.parametrize("settings", [{"nodes": 0.3}, {"every": 3}, {"added_noise": 3e-4}])
 def test_parts_of_the_motion_are_enough(settings: dict[str, float]) -> None:
     observed = Observations.of(thrown(), ObservationSettings(**settings))  # type: ignore[arg-type]
-    answer = identify(Drag(), observed, bounds=BOUNDS)
+    answer = identify_parameters(Drag(), observed, bounds=BOUNDS)
     assert answer["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=3.0)
     assert (answer.num_windows == 1) == ("nodes" in settings)
 
@@ -73,7 +73,7 @@ def test_bodies_are_those_of_the_first_observed_frame() -> None:
     seen = thrown(np.repeat([24.0, 38.0], 9))
     flags, hidden = np.ones(seen.pos.shape[:2], dtype=bool), seen.pos.copy()
     flags[:5], hidden[:5] = False, 0.0
-    answer = identify(Drag(), Observations(replace(seen, pos=hidden), flags), per_body=True, bounds=BOUNDS)
+    answer = identify_parameters(Drag(), Observations(replace(seen, pos=hidden), flags), per_body=True, bounds=BOUNDS)
     assert [value.name for value in answer.values] == ["sand.friction_angle#1", "sand.friction_angle#2"]
 
 
@@ -143,7 +143,7 @@ def test_frames_before_the_first_observed_one_are_not_used() -> None:
     flags[:12] = False
     hidden = seen.pos.copy()
     hidden[:12] = np.nan
-    answers = [identify(Drag(), Observations(replace(seen, pos=pos), flags), bounds=BOUNDS) for pos in (seen.pos, hidden)]
+    answers = [identify_parameters(Drag(), Observations(replace(seen, pos=pos), flags), bounds=BOUNDS) for pos in (seen.pos, hidden)]
     assert answers[0].values == answers[1].values
     assert answers[0]["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=3.0), "velocities at the start follow from positions"
 
@@ -151,4 +151,4 @@ def test_frames_before_the_first_observed_one_are_not_used() -> None:
 def test_windows_without_an_observed_frame_are_refused() -> None:
     with pytest.raises(ShootingError, match=r"no frame within shooting\.horizon=1 of the starts \[0\] is observed"):
         settings = ShootingSettings(horizon=1, num_windows=1)
-        identify(Drag(), Observations.of(thrown(), ObservationSettings(every=4)), bounds=BOUNDS, shooting_settings=settings)
+        identify_parameters(Drag(), Observations.of(thrown(), ObservationSettings(every=4)), bounds=BOUNDS, shooting_settings=settings)
