@@ -204,8 +204,8 @@ def _living(
 
 
 def _cell_data(trajectory: Trajectory, frame: int, num_particles: int) -> dict[str, np.ndarray]:
-    if trajectory.stress is None:
-        return {}
+    if trajectory.stress is None or trajectory.cells is None:
+        return {}  # the stress of particles is that of points
     stress = trajectory.stress.cell[frame]
     return _stress(np.concatenate([stress, np.full((num_particles, stress.shape[1]), np.nan, stress.dtype)]))
 

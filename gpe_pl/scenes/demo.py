@@ -52,6 +52,8 @@ def demo(model: str, parameter: float | None = None, seconds: float = 1.0, seed:
     trained = simulator.builder.metadata
     scene, solver = recorded_scene(trained), recorded_solver(trained)
     values = middle_values(simulator)
+    if parameter is not None and len(values) > 1:
+        raise ArgumentFault(f"parameter={parameter:g}: {name} knows {' and '.join(values)}, so it is not clear whose parameter this is")
     for material, own in values.items():
         first = trained.parameters_of(material)[0]
         own[first.name] = own[first.name] if parameter is None else parameter

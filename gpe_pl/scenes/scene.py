@@ -269,12 +269,12 @@ class Scene:
         return sliders(self, model or self.shipped(), seconds)
 
     def show(self) -> Path:
-        """Draw the scene to a file, and return its path. Parts with a fault are red."""
+        """Draw the scene to a file, and return its path. Bodies and zones that reach out of the box are red."""
         from gpe_pl.scenes.picture import draw
         from gpe_pl.viz.browser import open_page
 
         path = Path(tempfile.mkdtemp(prefix="gpe_")) / "scene.png"
-        draw(self, {}, path)
+        draw(self, self._misplaced(), path)
         if not open_page(path):
             print(f"no browser here; open {path}")
         return path
@@ -461,10 +461,14 @@ class Scene:
     def _shapes(self, spacing: float, faults: dict[str, str]) -> dict[str, Shape]:
         """Return the shapes of the obstacles by name."""
         shapes: dict[str, Shape] = {}
+        low, high = np.array(self.box).T
         for name, obstacle in self.obstacles:
             try:
                 shapes[name] = obstacle.shape(self.box, spacing) if isinstance(obstacle, MeshObstacle) else obstacle
                 shapes[name].signed_distance(np.zeros((1, self.dim)))
+                surface, _ = shapes[name].sample(spacing)
+                if not np.all((low < surface) & (surface < high), axis=1).any():
+                    faults[name] = "no part of its surface is in the box; move it, or leave it out"
             except GpeError as error:
                 faults[name] = str(error)
             except (ValueError, IndexError):

@@ -109,6 +109,10 @@ class TrainingSettings:
             raise ValueError(
                 f"val_interval={self.val_interval} must divide num_steps={self.num_steps}: the last steps would be neither validated nor saved"
             )
+        if self.final_learning_rate > self.learning_rate:
+            raise ValueError(
+                f"final_learning_rate={self.final_learning_rate:g} must be at most learning_rate={self.learning_rate:g}, from which the schedule falls"
+            )
         if self.augmentation.is_beyond_mirror and self.targets != "trajectory":
             raise ValueError(
                 f"rotate, quarter_turns and boost_speed: not together with targets={self.targets}, whose walls stay; set targets=trajectory"
@@ -232,6 +236,8 @@ def train(
         RunError: the accelerator or devices are not available, or training was interrupted; the message says how to resume.
         TrainingError: losses are not finite; the message names the last checkpoint.
         CheckpointError: training cannot resume from ``last.ckpt``.
+
+    A warning is logged if the training ends within its warm-up.
     """
     datamodule.push_forward = training.push_forward  # known only now, as it depends on the number of steps within a time budget
     interruption = Interruption()
@@ -249,6 +255,13 @@ def train(
     if trainer_settings.progress:
         own.append(StepProgress())
     trainer = _trainer(training, trainer_settings, loggers, run_dir, [*own, *callbacks])
+    if training.schedule == "cosine" and 0 < training.num_steps < training.warmup_steps:
+        log.warning(
+            "training.warmup_steps=%d: training ends at step %d, before the learning rate has reached training.learning_rate=%g",
+            training.warmup_steps,
+            training.num_steps,
+            training.learning_rate,
+        )
     last = checkpoints.last if checkpoints.last.exists() else None
     if last is not None:
         log.info("resuming from %s", last)

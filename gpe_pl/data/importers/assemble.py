@@ -273,6 +273,7 @@ class _Conversion:
         self._look_for_jumps(radius)
         survey.look_for_outliers()
         self._hold_out()
+        report.warnings += survey.recordings.across({split: survey.good[split] for split in SPLITS if split in survey.good})
         report.dim, report.frame_dt, report.periodic = dim, frame_dt, list(periodic)
         report.spacing, report.connectivity_radius, report.origin = spacing, radius, self.origin.tolist()
         ratio = float(np.median(survey.velocity_ratios)) if survey.velocity_ratios else 1.0

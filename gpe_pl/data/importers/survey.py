@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gpe_pl.data.free_flight import FreeFlight, vector
+from gpe_pl.data.importers.recordings import Recordings
 from gpe_pl.data.importers.report import Event
 from gpe_pl.data.importers.sampled import free_flight_of
 from gpe_pl.data.importers.source import Facts, Item, Loaded, Refusal
@@ -57,6 +58,7 @@ class Survey:
         spacings, radii: spacing and connectivity radius of each sampled trajectory [m].
         velocity_ratios: mean displacement over mean velocity × frame interval, of each sampled trajectory.
         scenes: names of trajectories by the digest of their positions.
+        recordings: what tells if trajectories are parts of one recording.
         motions: split, name and motion of each trajectory.
         assumes_gravity: for each trajectory, whether its gravity is only assumed to be the usual one of the format.
         suspects: warnings about trajectories.
@@ -77,6 +79,7 @@ class Survey:
     radii: list[float] = field(default_factory=list)
     velocity_ratios: list[float] = field(default_factory=list)
     scenes: dict[bytes, str] = field(default_factory=dict)
+    recordings: Recordings = field(default_factory=Recordings)
     motions: list[tuple[str, str, MotionSummary]] = field(default_factory=list)
     assumes_gravity: list[bool] = field(default_factory=list)
     suspects: list[Event] = field(default_factory=list)
@@ -117,6 +120,7 @@ class Survey:
             what = f"distances in a rigid body change by {deformation:.3g} of its size; models keep them"
             self.suspects.append(Event(split, name, -1, what))
         self.good.setdefault(split, []).append(item)
+        self.recordings.add(item, trajectory)
         self.suspects += [Event(split, name, -1, warning) for warning in loaded.warnings]
         self.motions.append((split, name, motion_of(m, trajectory.pos)))
         self.assumes_gravity.append(loaded.assumes_gravity)

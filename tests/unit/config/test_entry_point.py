@@ -214,6 +214,10 @@ def test_a_misspelling_beside_a_sweep_gets_the_valid_ones() -> None:
         ("+training.foo=1", "training.foo: unknown key; valid keys: num_steps"),
         ("graph.history=0", "graph.history=0: must be "),
         ("training.val_interval=7", "training: val_interval=7 must divide num_steps="),
+        (
+            "training.final_learning_rate=1",
+            "training: final_learning_rate=1 must be at most learning_rate=0.001, from which the schedule falls",
+        ),
         ("evaluation.splits=[tset]", "evaluation.splits.0='tset': must be 'train', 'val', 'test' or 'test_unseen'"),
         ("evaluation.splits=[]", r"evaluation.splits=\[\]: must have at least 1 values"),
         ("seed=-1", "seed=-1: must be an integer of at least 0"),

@@ -19,7 +19,7 @@ from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import node_code
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.openings import Opening
-from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
 from gpe_pl.viz.viewer import write_viewer
 
@@ -142,3 +142,11 @@ def test_vtk_has_the_nodes_that_are_there(channel: Trajectory, tmp_path: Path) -
         count = int(re.findall(r'NumberOfPoints="(\d+)"', text)[0])
         assert count == channel.alive[frame].sum()
         assert 'Name="node"' in text
+
+
+def test_vtk_has_the_stress_of_particles_at_points_only(channel: Trajectory, tmp_path: Path) -> None:
+    frames, nodes = channel.pos.shape[:2]
+    write_vtk(tmp_path / "channel.pvd", replace(channel, stress=Stress(np.ones((frames, nodes, 4)), np.ones((frames, 0, 4)))))
+    grid = (tmp_path / "channel" / "frame_00040.vtu").read_text()
+    points, cells = (grid[grid.index(f"<{part}>") : grid.index(f"</{part}>")] for part in ("PointData", "CellData"))
+    assert 'Name="von_mises"' in points and "von_mises" not in cells

@@ -61,6 +61,13 @@ def test_a_demo_that_cannot_be_is_refused(model: str | None, values: dict[str, o
         demo.run(model, values)
 
 
+def test_a_parameter_of_several_materials_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = {"sand": {"friction_angle": 30.0}, "elastomer": {"youngs_modulus": 1e5}}
+    monkeypatch.setattr("gpe_pl.scenes.rollouts.middle_values", lambda simulator: values)
+    with pytest.raises(ArgumentFault, match="parameter=30: sand knows sand and elastomer, so it is not clear whose parameter this is"):
+        demo.demo("sand", parameter=30.0)
+
+
 def test_info_says_settings_ranges_and_checks(capsys: pytest.CaptureFixture[str]) -> None:
     info.run("sand", {"speed": False})
     printed = capsys.readouterr().out

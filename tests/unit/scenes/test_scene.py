@@ -143,6 +143,7 @@ FAULTS: list[tuple[Callable[[], Any], str]] = [
     (lambda: column().block("sand", (0.5, 0.5), (0.01, 0.3)).predict(), "block 2 (sand): is 0.01 m thin, less than the distance of nodes, 0.015625 m"),
     (lambda: column().block("sand", (0.15, 0.1), (0.3, 0.3)).predict(), "block 2 (sand): overlaps block 1 (sand); move one of the two"),
     (lambda: column().obstacle(Circle((0.2, 0.1), 0.05)).predict(), "block 1 (sand): 27 of its 128 nodes are inside obstacle 1; move one of the two"),
+    (lambda: column().obstacle(Circle((3.0, 0.5), 0.1)).predict(), "obstacle 1: no part of its surface is in the box; move it, or leave it out"),
     (lambda: column().obstacle(Box((0.5, 0.0, 0.0), (0.6, 0.1, 0.1), 0.4)).predict(), "obstacle 1: Box"),
 ]  # fmt: skip
 
@@ -212,6 +213,17 @@ def test_predict_draws_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyP
         predict.run("scene.yaml", {})
     red = np.asarray(Image.open("scene_faults.png").convert("RGB")).astype(int)
     assert ((red[..., 0] > 180) & (red[..., 1] < 90) & (red[..., 2] < 90)).sum() > 500
+
+
+def test_a_body_outside_the_box_is_drawn_in_red(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gpe_pl.viz.browser.open_page", lambda path: True)
+
+    def count_red(scene: Scene) -> int:
+        red = np.asarray(Image.open(scene.show()).convert("RGB")).astype(int)
+        return int(((red[..., 0] > 180) & (red[..., 1] < 90) & (red[..., 2] < 90)).sum())
+
+    assert count_red(column().block("snow", (0.9, 0.5), (0.3, 0.1))) > 100
+    assert count_red(column().block("snow", (0.6, 0.5), (0.3, 0.1))) == 0
 
 
 def test_examples_of_the_guide_are_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

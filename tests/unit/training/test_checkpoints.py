@@ -91,6 +91,7 @@ def trained(
     minutes: float = math.inf,
     at: dict[int, Callable[[], None]] | None = None,
     starts_trained: bool = False,
+    warmup_steps: int = 2,
 ) -> Path:
     """Train in a folder, or resume; ``at`` acts before steps."""
 
@@ -108,11 +109,11 @@ def trained(
         val_interval=INTERVAL,
         num_val_rollouts=1,
         val_rollout_steps=2,
-        warmup_steps=2,
+        warmup_steps=warmup_steps,
         push_fraction=push_fraction,
         push_steps=2,
     )
-    module = Disturbed(simulator, STEPS, warmup_steps=2, compile="off")
+    module = Disturbed(simulator, STEPS, warmup_steps=warmup_steps, compile="off")
     run.mkdir(parents=True, exist_ok=True)
     trainer = TrainerSettings(progress=False, checkpoint_minutes=minutes)
     return train(module, module_data, settings, trainer, [CSVLogger(run, name="log")], run, starts_trained=starts_trained)
@@ -158,6 +159,14 @@ def test_a_trained_model_stays_the_best_unless_a_later_one_is(
         assert ("every validation was clearly worse than the model at the start" in caplog.text) == (best == 0)
     start_weights, averaged = (stored(tmp_path / "better", "best")[key] for key in ("current_model_state", "state_dict"))
     assert all(torch.equal(start_weights[key], value) for key, value in averaged.items())  # no step has changed them
+
+
+@pytest.mark.parametrize(("warmup_steps", "warns"), [(STEPS, False), (STEPS + 1, True)])
+def test_a_training_that_ends_within_its_warm_up_says_so(
+    warmup_steps: int, warns: bool, data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    trained(data, tmp_path, warmup_steps=warmup_steps)
+    assert ("before the learning rate has reached training.learning_rate=0.001" in caplog.text) == warns
 
 
 def test_a_run_that_was_moved_knows_its_best_checkpoint(data: Path, tmp_path: Path, errors: dict[int, list[float]]) -> None:
