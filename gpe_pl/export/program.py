@@ -160,8 +160,10 @@ class ExportedStep(nn.Module):
         body = {m: scene[f"body.{m}"] for m in spec.meshes}
         num_bodies = sum(b.shape[0] for b in body.values())
         label = torch.cat([scene[f"island.{m}"] for m in spec.materials])
-        arm = torch.cat([scene[f"arm.{m}"] for m in spec.materials]) if self.simulator.builder.metadata.periodicity else None
-        return IslandTopology(label, scene["island_is_free"], body, num_bodies, arm)
+        arm, body_arm = None, None
+        if self.simulator.builder.metadata.periodicity:
+            arm, body_arm = torch.cat([scene[f"arm.{m}"] for m in spec.materials]), {m: scene[f"body_arm.{m}"] for m in spec.meshes}
+        return IslandTopology(label, scene["island_is_free"], body, num_bodies, arm, body_arm)
 
 
 def describe(simulator: LearnedSimulator) -> dict[str, Input]:
@@ -192,6 +194,9 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
         if spec.islands and is_periodic:
             doc = "position relative to the mean of the node's group, measured along edges; 0 in a group that reaches around the domain"
             inputs[f"arm.{m}"] = Input((m, dim), "float64", "m", doc)
+        if spec.islands and is_periodic and m in spec.meshes:
+            doc = "position relative to the mean of the node's body, measured along edges of cells; 0 for all nodes if there are no cells"
+            inputs[f"body_arm.{m}"] = Input((m, dim), "float64", "m", doc)
     if spec.islands:
         doc = "whether a group has no edge to the boundary"
         inputs["island_is_free"] = Input(("island",), "bool", "1", doc)
@@ -271,6 +276,8 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
                 values["arm"] = islands.arm[rows]
             if m in islands.body:
                 values["body"] = islands.body[m]
+            if islands.body_arm is not None and m in islands.body_arm:
+                values["body_arm"] = islands.body_arm[m]
         scene |= {f"{name}.{m}": value for name, value in values.items()}
     if islands is not None:
         scene["island_is_free"] = islands.is_free

@@ -70,7 +70,8 @@ class GraphBuilder:
     wraps around the domain this is impossible, and ``pos`` is zero.
 
     With ``config.islands`` and ``config.mesh``, nodes of meshes also have ``body``, and the graph has ``num_bodies`` [1]. A body consists of the nodes that
-    cells connect, and of nodes without a cell beside them. ``body`` is -1 in a scene without cells.
+    cells connect, and of nodes without a cell beside them. ``body`` is -1 in a scene without cells. In periodic domains these nodes also have ``body_arm`` [m],
+    the position relative to the mean of the body, since an island may wrap around the domain while its bodies do not.
 
     With ``config.cells``, the graph has ``gravity`` [1, dim] in m/frame², and nodes of meshes have:
 
@@ -237,6 +238,12 @@ class GraphBuilder:
             data.island_is_free, data.num_islands = islands.is_free, torch.full((1,), num_islands, device=arm.device)
             for material, body in islands.body.items():
                 data[material].body = body
+                if islands.body_arm is not None:
+                    own = islands.body_arm[material]
+                    if state.pos.requires_grad and islands.num_bodies:
+                        change = from_centre(state.pos[topology.rows[material]], body, islands.num_bodies)
+                        own = own + change - change.detach()
+                    data[material].body_arm = self._rounded(own)
             if self.spec.meshes:
                 data.num_bodies = torch.full((1,), islands.num_bodies, device=arm.device)
         return self._with_stress_and_loads(self._with_cells(data, topology, state), topology, state)

@@ -42,7 +42,7 @@ def works_on(state: State) -> bool:
     if state.pos.device.type != "cpu" or torch.compiler.is_compiling() or not is_wanted():
         return False
     b = state.boundary
-    used = (state.pos, state.vel, state.velocity_history, state.mass, state.material_params, state.gravity)
+    used = (state.pos, state.vel, state.velocity_history, state.frame_velocity, state.mass, state.material_params, state.gravity)
     walls = (b.pos, b.vel, b.normal, b.friction, b.restitution)
     return not torch.is_grad_enabled() or not any(x is not None and x.requires_grad for x in (*used, *walls))
 
@@ -207,6 +207,8 @@ class CompiledGraph:
             stores[material] |= {"pos": torch.from_numpy(arm[own]), "island": torch.from_numpy(label[own])}
         for material, body in islands.body.items():
             stores[material]["body"] = body
+            if islands.body_arm is not None:
+                stores[material]["body_arm"] = torch.from_numpy(islands.body_arm[material].numpy().astype(self.precision))
 
 
 def _array(x: Tensor) -> np.ndarray:

@@ -21,6 +21,10 @@ BLUNTEST = 0.42
 the angle is below 130°. On a disc with a radius of three spacings the length is 0.17."""
 MOST_FRICTION = 1e6
 """Largest Coulomb coefficient."""
+OPPOSITE = -1.5
+"""A neighbour of a boundary node is on the other face of a thin plate if the cosines of its direction and of its normal with the node's normal add up to less.
+At the tip of an obstacle with any angle they add up to at least −√2."""
+TINY = 1e-300
 NORMAL_STEP = 1e-4
 """Step of the differences of distances that give normals [rest spacings]."""
 
@@ -100,7 +104,7 @@ def corners_near_edges(
         edges: nodes of the edges, see ``oriented_edges``.
         boundary: boundary nodes.
         spacing: rest spacing [m].
-        radius: largest distance of a corner from the middle of an edge [m].
+        radius: largest distance of a corner from an edge [m].
 
     Returns:
         For each pair the nodes at the ends of the edge, with the body on the left of the edge; and the vector from the first of these nodes to the corner [m]
@@ -108,8 +112,11 @@ def corners_near_edges(
     """
     corner = convex_corners(boundary, spacing)
     where, point = as_numpy(pos), as_numpy(boundary.pos)[corner]
-    middle = 0.5 * (where[edges[:, 0]] + where[edges[:, 1]])
-    edge, which = np.nonzero(((middle[:, None] - point[None]) ** 2).sum(axis=2) < radius**2)
+    first, along = where[edges[:, 0]], where[edges[:, 1]] - where[edges[:, 0]]
+    way = point[None] - first[:, None]
+    part = (way * along[:, None]).sum(axis=2) / np.maximum((along**2).sum(axis=1), TINY)[:, None]
+    away = way - np.clip(part, 0.0, 1.0)[..., None] * along[:, None]
+    edge, which = np.nonzero((away**2).sum(axis=2) < radius**2)
     ends = edges[edge]
     values = beside_first_node(where[ends[:, 0]], boundary, corner[which])
     nodes, corners = torch.from_numpy(ends).to(pos.device), torch.from_numpy(values).to(pos)
@@ -125,18 +132,17 @@ def beside_first_node(
 
 
 def oriented_edges(rest_pos: Float64[Tensor, "node 2"], cells: Int64[Tensor, "cell corner"]) -> Int64[np.ndarray, "edge 2"]:
-    """Return ``surface_edges`` of plane cells, all in one sense, with the body on the left of each edge.
+    """Return the edges of ``surface_edges`` with the body on the left of each.
 
     Args:
         rest_pos: positions of nodes at rest [m].
         cells: corners of the cells.
     """
-    edges = surface_edges(cells.cpu().numpy())
-    if not len(edges):
-        return edges
-    a, b, c = rest_pos[cells[0, :3]]
-    is_clockwise = (b - a)[0] * (c - b)[1] < (b - a)[1] * (c - b)[0]  # the cells of a mirror image
-    return np.ascontiguousarray(edges[:, ::-1]) if is_clockwise else edges
+    corners = cells.cpu().numpy()
+    edges, owner = surface_edges(corners)
+    x, y = as_numpy(rest_pos)[corners].transpose(2, 0, 1)
+    area = (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1)
+    return np.where((area < 0)[owner, None], edges[:, ::-1], edges)  # the corners of some cells, and of mirror images, go round clockwise
 
 
 def convex_corners(boundary: Boundary, spacing: float) -> np.ndarray:
@@ -157,24 +163,30 @@ def _convex_corners(pos: np.ndarray, normal: np.ndarray, spacing: float) -> np.n
     way = pos[both[:, 1]] - pos[both[:, 0]]
     distance = np.linalg.norm(way, axis=1)
     apart = distance > 1e-6 * spacing  # walls share the nodes of their corners
+    unit = way / np.maximum(distance, TINY)[:, None]
+    apart &= ((unit + normal[both[:, 1]]) * normal[both[:, 0]]).sum(axis=1) > OPPOSITE
     total = np.zeros_like(pos)
-    np.add.at(total, both[apart, 0], way[apart] / distance[apart, None])
+    np.add.at(total, both[apart, 0], unit[apart])
     mean = total / np.maximum(np.bincount(both[apart, 0], minlength=len(pos)), 1)[:, None]
     is_convex = (mean * normal).sum(axis=1) < -0.1  # the neighbours are on the side of the solid; 0 at the end of a straight line
     return np.flatnonzero((np.linalg.norm(mean, axis=1) > BLUNTEST) & is_convex)
 
 
 @lru_cache(maxsize=64)
-def _surface_edges(data: bytes, num_corners: int) -> np.ndarray:
+def _surface_edges(data: bytes, num_corners: int) -> tuple[Int64[np.ndarray, "edge 2"], Int64[np.ndarray, " edge"]]:
     cells = np.frombuffer(data, dtype=np.int64).reshape(-1, num_corners)
     edges = np.concatenate([np.stack([cells[:, k], cells[:, (k + 1) % num_corners]], axis=1) for k in range(num_corners)])
-    edges = edges[edges[:, 0] != edges[:, 1]]
+    owner = np.tile(np.arange(len(cells)), num_corners)
+    real = edges[:, 0] != edges[:, 1]
+    edges, owner = edges[real], owner[real]
     _, first, times = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
-    return _neighbours_apart(edges[np.sort(first[times == 1])])
+    own = np.sort(first[times == 1])
+    own = own[_neighbours_apart(edges[own])]
+    return edges[own], owner[own]
 
 
 def _neighbours_apart(edges: np.ndarray) -> np.ndarray:
-    """Return the edges in the order of sets: no two edges of a set share a node, and each set takes as many of the remaining edges as it can."""
+    """Return the numbers of the edges in the order of sets: no two edges of a set share a node, and each set takes as many of the remaining edges as it can."""
     sets: list[tuple[set[int], list[int]]] = []
     for number, ends in enumerate(edges.tolist()):
         nodes, numbers = next((own for own in sets if own[0].isdisjoint(ends)), (set(), []))
@@ -182,13 +194,15 @@ def _neighbours_apart(edges: np.ndarray) -> np.ndarray:
             sets.append((nodes, numbers))
         nodes.update(ends)
         numbers.append(number)
-    return edges[[number for _, numbers in sets for number in numbers]] if sets else edges
+    return np.array([number for _, numbers in sets for number in numbers], dtype=np.int64)
 
 
-def surface_edges(cells: np.ndarray) -> np.ndarray:
-    """Return the edges that belong to only one plane cell [edge, 2], each in the direction of the cell's corners. Results are cached.
+def surface_edges(cells: np.ndarray) -> tuple[Int64[np.ndarray, "edge 2"], Int64[np.ndarray, " edge"]]:
+    """Return the edges that belong to only one plane cell, each in the direction of the cell's corners, and the number of that cell. Results are cached.
 
     Edges that share a node are far apart in the list, so that ``nn.elastic_motion`` can compute contacts of successive edges together.
     """
+    if not len(cells):
+        return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.int64)
     cells = np.ascontiguousarray(cells, dtype=np.int64)
-    return _surface_edges(cells.tobytes(), cells.shape[1]) if len(cells) else np.empty((0, 2), dtype=np.int64)
+    return _surface_edges(cells.tobytes(), cells.shape[1])

@@ -44,9 +44,12 @@ def near_corners(pos, rows, edges, points, corners, square):
     count = 0
     for e in range(edges.shape[0]):
         i, j = rows[edges[e, 0]], rows[edges[e, 1]]
-        x, y = 0.5 * (pos[i, 0] + pos[j, 0]), 0.5 * (pos[i, 1] + pos[j, 1])
+        ax, ay = pos[j, 0] - pos[i, 0], pos[j, 1] - pos[i, 1]
+        length = max(ax * ax + ay * ay, 1e-300)
         for c in range(corners.shape[0]):
-            dx, dy = x - points[corners[c], 0], y - points[corners[c], 1]
+            dx, dy = points[corners[c], 0] - pos[i, 0], points[corners[c], 1] - pos[i, 1]
+            part = min(max((dx * ax + dy * ay) / length, 0.0), 1.0)
+            dx, dy = dx - part * ax, dy - part * ay
             if dx * dx + dy * dy < square:
                 found[count, 0], found[count, 1] = e, c
                 count += 1

@@ -104,7 +104,9 @@ def _joined_islands(islands: Sequence[IslandTopology]) -> IslandTopology:
     label = _shifted([i.label for i in islands], [len(i.is_free) for i in islands])
     body = {m: torch.cat([i.body[m] for i in islands]) for m in islands[0].body}
     arms = [i.arm for i in islands if i.arm is not None]
-    return IslandTopology(label, torch.cat([i.is_free for i in islands]), body, 0, torch.cat(arms) if arms else None)
+    body_arms = [i.body_arm for i in islands if i.body_arm is not None]
+    body_arm = {m: torch.cat([own[m] for own in body_arms]) for m in body_arms[0]} if body_arms else None
+    return IslandTopology(label, torch.cat([i.is_free for i in islands]), body, 0, torch.cat(arms) if arms else None, body_arm)
 
 
 def _shifted(parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:

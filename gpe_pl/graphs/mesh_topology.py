@@ -34,6 +34,7 @@ class MeshParts:
         at_rest: virtual nodes and their edges; in periodic domains without the shifts of a frame.
         body: body that each node of the materials with meshes moves with, by material.
         num_bodies: number of these bodies.
+        joints: pairs of nodes that belong to one body: those with a common cell, and nodes without a cell with the node beside them.
         cell_keys: sorted ``pair_keys`` of the edges along cells.
     """
 
@@ -42,6 +43,7 @@ class MeshParts:
     at_rest: MeshTopology
     body: dict[str, Int64[Tensor, " _"]]
     num_bodies: int
+    joints: Int64[np.ndarray, "2 joint"]
     cell_keys: Int64[np.ndarray, " cell_edge"]
 
     def contacts(self, pairs: Int64[np.ndarray, "2 pair"], radius: float) -> Int64[np.ndarray, "2 contact"]:
@@ -59,7 +61,7 @@ class MeshParts:
         """
         if not periodicity:
             return self.at_rest
-        shifts, goes_around = image_shifts(pos, self.mesh.cell_edges, periodicity)
+        shifts, goes_around = image_shifts(pos, self.joints, periodicity)
         if goes_around.any():
             raise GraphError(f"the mesh of node {int(goes_around.argmax())} goes around the periodic domain, so it has no rest shape")
         return replace(self.at_rest, shift=torch.from_numpy(shifts))
@@ -78,7 +80,8 @@ def mesh_parts(state: State, spec: FeatureSpec, scales: Scales) -> MeshParts | N
         raise GraphError("state has cells but no rest_pos; a mesh needs both, or graph.mesh=false takes its nodes as particles")
     rest_pos, cells, kinds = (np.ascontiguousarray(x.cpu().numpy()) for x in (state.rest_pos, state.cells, state.node_type))
     mesh = multiscale_graph(rest_pos, cells, scales.spacing, spec.num_levels, state.periodicity)
-    return _parts(mesh, cells.tobytes(), cells.shape, kinds.tobytes(), spec.materials, spec.relations, spec.num_levels, scales.spacing)
+    settings = spec.materials, spec.relations, spec.num_levels, scales.spacing, state.periodicity
+    return _parts(mesh, cells.tobytes(), cells.shape, kinds.tobytes(), *settings)
 
 
 @lru_cache(maxsize=MAX_CACHED)
@@ -92,6 +95,7 @@ def _parts(
     relations: tuple[EdgeType, ...],
     num_levels: int,
     spacing: float,
+    periodicity: Periodicity,
 ) -> MeshParts:
     kind, meshes = np.frombuffer(kinds, np.int64), tuple(r[0] for r in relations if r[1] == CELL)
     _check_cells(np.frombuffer(cells, np.int64).reshape(shape), kind, meshes)
@@ -102,7 +106,8 @@ def _parts(
         row[: mesh.num_nodes][own] = np.arange(own.sum())
     row[mesh.num_nodes :] = np.concatenate([np.arange(0), *map(np.arange, num_virtual)])
     ends = dict(_ends(mesh, kind, relations, meshes))
-    body, num_bodies = _bodies(mesh, kind, meshes, spacing)
+    moves_with, bonds = mesh.moving_bodies(kind, spacing, periodicity)
+    body, num_bodies = _bodies(moves_with, kind, meshes)
     at_rest = MeshTopology(
         tuple(num_virtual.tolist()),
         torch.from_numpy(np.stack([mesh.descent[0] - mesh.num_nodes, mesh.descent[1]])),
@@ -110,7 +115,8 @@ def _parts(
         edges=MeshEdges(tuple(ends), tuple(e.shape[1] for e in ends.values()), torch.from_numpy(np.concatenate([*ends.values()], axis=1))),
     )
     edges = {relation: torch.from_numpy(row[e]) for relation, e in ends.items()}
-    return MeshParts(mesh, edges, at_rest, body, num_bodies, np.sort(pair_keys(mesh.cell_edges, mesh.num_nodes)))
+    joints = np.concatenate([mesh.cell_edges, bonds], axis=1)
+    return MeshParts(mesh, edges, at_rest, body, num_bodies, joints, np.sort(pair_keys(mesh.cell_edges, mesh.num_nodes)))
 
 
 def _check_cells(cells: np.ndarray, kind: np.ndarray, meshes: tuple[str, ...]) -> None:
@@ -139,11 +145,10 @@ def _ends(
         yield relation, chosen
 
 
-def _bodies(mesh: MultiscaleGraph, kind: np.ndarray, meshes: tuple[str, ...], spacing: float) -> tuple[dict[str, Tensor], int]:
+def _bodies(moves_with: np.ndarray, kind: np.ndarray, meshes: tuple[str, ...]) -> tuple[dict[str, Tensor], int]:
     """Return the body that each mesh node moves with, by material, and the number of bodies."""
     rows = [np.flatnonzero(kind == node_code(m)) for m in meshes]
-    moves_with = mesh.moving_bodies(kind, spacing)[np.concatenate(rows)]
-    names, body = np.unique(moves_with, return_inverse=True)
+    names, body = np.unique(moves_with[np.concatenate(rows)], return_inverse=True)
     parts = torch.from_numpy(body).split([len(r) for r in rows])
     return dict(zip(meshes, parts, strict=True)), len(names)
 

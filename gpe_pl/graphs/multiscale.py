@@ -16,11 +16,11 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.spatial import cKDTree
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.graphs.islands import unwrapped
+from gpe_pl.trajectory.boundary import search_tree
 from gpe_pl.trajectory.cells import cell_edges, components, pair_keys, unique_pairs
 
 SNAP = 1e-3
@@ -69,8 +69,10 @@ class MultiscaleGraph:
         """Number of nodes of the state."""
         return len(self.rest_pos)
 
-    def moving_bodies(self, kind: Int64[np.ndarray, " node"], spacing: float) -> Int64[np.ndarray, " node"]:
-        """Return the body that each node of the state moves with.
+    def moving_bodies(
+        self, kind: Int64[np.ndarray, " node"], spacing: float, periodicity: Periodicity = NOWHERE
+    ) -> tuple[Int64[np.ndarray, " node"], Int64[np.ndarray, "2 bond"]]:
+        """Return the body that each node of the state moves with, and the bonds: pairs of a node without a cell and the node beside it that has its body.
 
         A node without a cell moves with the body of its kind that lies within ``REACH`` spacings at rest, directly or through other nodes without a cell. If
         there is no such body, the node is a body of its own.
@@ -78,8 +80,9 @@ class MultiscaleGraph:
         Args:
             kind: node types.
             spacing: rest spacing [m].
+            periodicity: axes along which space repeats.
         """
-        return _moving_bodies(self, kind.tobytes(), spacing)
+        return _moving_bodies(self, kind.tobytes(), spacing, periodicity)
 
     def are_in_contact(self, pairs: Int64[np.ndarray, "2 edge"], radius: float) -> Bool[np.ndarray, " edge"]:
         """Return a mask of the pairs of nodes that are contacts, given pairs of nodes whose present distance is below the radius [m].
@@ -143,20 +146,26 @@ def _cached(
 
 
 @lru_cache(maxsize=MAX_CACHED)
-def _moving_bodies(graph: MultiscaleGraph, kind: bytes, spacing: float) -> Int64[np.ndarray, " node"]:
+def _moving_bodies(
+    graph: MultiscaleGraph, kind: bytes, spacing: float, periodicity: Periodicity
+) -> tuple[Int64[np.ndarray, " node"], Int64[np.ndarray, "2 bond"]]:
     body, kinds = graph.body[: graph.num_nodes].copy(), np.frombuffer(kind, np.int64)
+    bonds, inside = [np.empty((2, 0), np.int64)], periodicity.from_corner(graph.rest_pos) if periodicity else graph.rest_pos
     is_placed = np.zeros(graph.num_nodes, dtype=bool)
     is_placed[graph.cell_edges] = True
     for code in np.unique(kinds):
         loose = np.flatnonzero((kinds == code) & ~is_placed)
         placed = np.flatnonzero((kinds == code) & is_placed)
         while len(loose) and len(placed):  # then those beside the ones that found their body
-            distance, nearest = cKDTree(graph.rest_pos[placed]).query(graph.rest_pos[loose])
+            distance, nearest = search_tree(graph.rest_pos[placed], periodicity).query(inside[loose])
             found = distance <= REACH * spacing
             body[loose[found]] = body[placed[nearest[found]]]
+            bonds.append(np.stack([placed[nearest[found]], loose[found]]))
             loose, placed = loose[~found], loose[found]
+    pairs = np.concatenate(bonds, axis=1)
     body.setflags(write=False)
-    return body
+    pairs.setflags(write=False)
+    return body, pairs
 
 
 def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: int, periodicity: Periodicity = NOWHERE) -> MultiscaleGraph:

@@ -10,7 +10,7 @@ from gpe_pl.graphs.features import GraphConfig, Scales, from_centre
 from gpe_pl.graphs.islands import find_islands, image_shifts
 from gpe_pl.graphs.mesh_topology import MeshParts, mesh_parts
 from gpe_pl.graphs.neighbors import Points, radius_between, radius_pairs
-from gpe_pl.graphs.topology import IslandTopology, Topology
+from gpe_pl.graphs.topology import IslandTopology, MeshTopology, Topology
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, MATERIALS, RADIUS, EdgeType, FeatureSpec, node_code
 from gpe_pl.trajectory.openings import carried
@@ -70,7 +70,7 @@ def find_topology(
         edges |= {relation: edge_index.to(device) for relation, edge_index in parts.edges.items()}
         mesh = parts.topology(points.pos, space).to(device)
     if config.islands:
-        islands = _islands(points, pairs, touched, parts, numbers, spec).to(device)
+        islands = _islands(points, pairs, touched, parts, mesh, numbers, spec).to(device)
     rows_of_boundary = None if boundary_rows is None else torch.from_numpy(boundary_rows).to(device)
     return Topology(rows, edges, rows_of_boundary, mesh, islands, space)
 
@@ -141,6 +141,7 @@ def _islands(
     pairs: np.ndarray,
     touched: np.ndarray,
     parts: MeshParts | None,
+    mesh: MeshTopology | None,
     rows: dict[str, np.ndarray],
     spec: FeatureSpec,
 ) -> IslandTopology:
@@ -154,22 +155,30 @@ def _islands(
         pairs: pairs of nodes with an edge within the radius.
         touched: nodes with an edge to the boundary, and nodes whose motion is given.
         parts: meshes of the scene.
+        mesh: the virtual nodes of the frame, with the shifts of the meshes.
         rows: rows of each material's nodes in the state.
         spec: node types of the graph.
     """
     touches = np.zeros(len(points), dtype=bool)
     touches[touched] = True
     if parts is not None:
-        pairs = np.concatenate([pairs, parts.mesh.cell_edges], axis=1)
+        pairs = np.concatenate([pairs, parts.joints], axis=1)  # a body is in one island
     islands, arm = find_islands(len(points), pairs, touches), None
     if points.periodicity:
         shift, goes_around = image_shifts(points.pos, pairs, points.periodicity)
         whole = np.where(goes_around[:, None], 0.0, points.pos + shift)
         arm = from_centre(torch.from_numpy(whole), torch.from_numpy(islands.label), len(islands.is_free))
     label, is_free = torch.from_numpy(islands.label), torch.from_numpy(islands.is_free)
-    if parts is None:
-        return IslandTopology(label, is_free, {m: torch.full((len(rows[m]),), -1) for m in spec.meshes}, 0, arm)
-    return IslandTopology(label, is_free, parts.body, parts.num_bodies, arm)
+    if parts is None or mesh is None:
+        no_arms = (
+            {m: torch.zeros(len(rows[m]), points.pos.shape[1], dtype=torch.float64) for m in spec.meshes} if points.periodicity else None
+        )
+        return IslandTopology(label, is_free, {m: torch.full((len(rows[m]),), -1) for m in spec.meshes}, 0, arm, no_arms)
+    body_arm = None
+    if mesh.shift is not None:
+        whole = points.pos + mesh.shift.cpu().numpy()
+        body_arm = {m: from_centre(torch.from_numpy(whole[rows[m]]), body, parts.num_bodies) for m, body in parts.body.items()}
+    return IslandTopology(label, is_free, parts.body, parts.num_bodies, arm, body_arm)
 
 
 def as_array(x: Tensor) -> np.ndarray:

@@ -90,6 +90,7 @@ class IslandTopology:
         num_bodies: number of bodies, or an upper bound of it.
         arm: positions relative to the mean of the island [m], for periodic domains; zero in an island that wraps around the domain. None if they follow from
             positions alone.
+        body_arm: for each material of meshes, positions relative to the mean of the body [m], for periodic domains; None elsewhere, where ``arm`` is as good.
     """
 
     label: Int64[Tensor, " node"]
@@ -97,15 +98,16 @@ class IslandTopology:
     body: dict[str, Int64[Tensor, " _"]]
     num_bodies: int
     arm: Float64[Tensor, "node dim"] | None = None
+    body_arm: dict[str, Float64[Tensor, "_ dim"]] | None = None
 
     def to(self, device: torch.device) -> IslandTopology:
         """Return the same islands on a device."""
         if device.type == "cpu":
             return self
         body = {m: b.to(device) for m, b in self.body.items()}
-        return IslandTopology(
-            self.label.to(device), self.is_free.to(device), body, self.num_bodies, None if self.arm is None else self.arm.to(device)
-        )
+        arm = None if self.arm is None else self.arm.to(device)
+        body_arm = None if self.body_arm is None else {m: b.to(device) for m, b in self.body_arm.items()}
+        return IslandTopology(self.label.to(device), self.is_free.to(device), body, self.num_bodies, arm, body_arm)
 
 
 @dataclass(frozen=True)

@@ -34,13 +34,14 @@ def joined(parts: list[Tensor]) -> Tensor:
 
 
 def grouped(data: HeteroData, materials: Iterable[str], name: str, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return mass, position and group (``island`` or ``body``) of the nodes of these materials; graphs of a batch number groups from 0; −1: no group."""
+    """Return mass, lever arm and group (``island`` or ``body``) of the nodes of these materials; graphs of a batch number groups from 0; −1: no group."""
     stores = [data[m] for m in materials]
+    arm = "body_arm" if name == "body" and "body_arm" in stores[0] else "pos"
     if len(stores) == 1 and "batch" not in stores[0]:
-        return stores[0].mass, stores[0].pos, stores[0][name]
+        return stores[0].mass, stores[0][arm], stores[0][name]
     start = torch.cumsum(count, dim=0) - count
     group = torch.cat([torch.where(s[name] < 0, s[name], s[name] + start[s.batch]) if "batch" in s else s[name] for s in stores])
-    return torch.cat([s.mass for s in stores]), torch.cat([s.pos for s in stores]), group
+    return torch.cat([s.mass for s in stores]), torch.cat([s[arm] for s in stores]), group
 
 
 def conserve(

@@ -13,7 +13,7 @@ from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.geometry.repeated_shapes import is_covered, repeated
 from gpe_pl.geometry.shapes import Shape, surface_tolerance
 from gpe_pl.schema import STICKY
-from gpe_pl.trajectory.arrays import ArrayError, numbers, per_node, positive
+from gpe_pl.trajectory.arrays import ArrayError, nearest_distances, numbers, per_node, positive
 from gpe_pl.trajectory.kinds import NODE, SCENE, names_of
 from gpe_pl.trajectory.rigid_parts import carried_along
 
@@ -124,7 +124,7 @@ class Boundary:
             vel: velocity in m/s of walls that slide along themselves: one for all nodes [dim] or one per node [boundary_node, dim].
             friction: Coulomb coefficient, one for all nodes or one per node; ``schema.STICKY`` is no-slip.
             restitution: fraction of the normal velocity that a bounce returns, one for all nodes or one per node.
-            shapes: geometry of the walls, if known; containment and pictures use it.
+            shapes: geometry of all walls, if known; containment, pictures and the elastic law use it instead of the points.
 
         Raises:
             ArrayError: an array has the wrong shape, a number is not finite or out of range, or a normal has length 0. The message names the node.
@@ -259,6 +259,19 @@ def _unit(normal: np.ndarray) -> np.ndarray:
         where = f"frame {frame[0]}, " if frame else ""
         raise ArrayError(f"boundary normal: {where}boundary_node {node} has length 0; it must point into free space", *frame)
     return np.asarray(normal / length)
+
+
+def check_on_surfaces(boundary: Boundary) -> None:
+    """Raise ``ArrayError`` if a boundary has shapes, but a node is farther from the surfaces of all of them than half the usual distance of nodes."""
+    if not boundary.shapes or not len(boundary.pos):
+        return
+    pos = as_numpy(boundary.pos).astype(np.float64)
+    distance = np.min([np.abs(shape.signed_distance(pos)) for shape in boundary.shapes], axis=0)
+    node, apart = int(distance.argmax()), float(np.median(nearest_distances(pos)))
+    if distance[node] > max(0.5 * apart, 1e-3 * float(np.ptp(pos, axis=0).max())):
+        raise ArrayError(
+            f"boundary shapes: boundary_node {node} is {distance[node]:.3g} m from the surface of every shape; give the shapes of all walls, or none"
+        )
 
 
 def check_steps(boundary: Boundary, frame_dt: float, periodicity: Periodicity) -> None:

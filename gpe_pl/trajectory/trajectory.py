@@ -30,7 +30,7 @@ from gpe_pl.trajectory.arrays import (
     typical_spacing,
     velocities_of,
 )
-from gpe_pl.trajectory.boundary import Array, Boundary, check_steps
+from gpe_pl.trajectory.boundary import Array, Boundary, check_on_surfaces, check_steps
 from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.living import held, living
 from gpe_pl.trajectory.loads import Loads
@@ -317,6 +317,7 @@ class Trajectory:
         periodicity = Periodicity(bounds, repeats)
         check_steps(boundary, frame_dt, periodicity)
         boundary = boundary.inside(periodicity)
+        check_on_surfaces(boundary)
         if periodicity:
             pos = np.stack([periodicity.wrapped(frame.astype(np.float64)).astype(pos.dtype) for frame in pos])
         codes, columns, names, stored = checked_materials(materials, params, num_nodes)

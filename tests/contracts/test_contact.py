@@ -63,6 +63,34 @@ def test_contacts_alone_move_and_turn_a_body(kind: str) -> None:
     torch.testing.assert_close(predicted["sand"], decoded.acceleration["sand"], rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("way", [(0.0, 0.0), (-3.0, 1.0), (-8.0, 4.0)])
+def test_a_loose_node_that_has_left_its_body_turns_it_by_its_own_lever(way: tuple[float, float]) -> None:
+    build, s = builder(("elastomer",)), with_loose_nodes()
+    assert s.cells is not None
+    loose = np.setdiff1d(np.arange(s.num_nodes), s.cells)
+    pos = s.pos.copy()
+    pos[loose[0]] += scenes.SPACING * np.array(way)
+    assert_newton_and_euler(build, replace(s, pos=pos))
+
+
+def assert_newton_and_euler(build: GraphBuilder, s: State) -> None:
+    """Check that contacts alone move and turn each body, with levers that are those of the state. No body lies across a seam."""
+    data = double(build, s)
+    data.island_is_free[:] = False
+    predicted, decoded = prediction_and_parts(contact_model(build), data)
+    mass, body, pos = data["elastomer"].mass, data["elastomer"].body, torch.from_numpy(s.pos)[data["elastomer"].node_id]
+    force = decoded.contact["elastomer"] * mass[:, None]
+    assert int(data.num_bodies) >= 2
+    for b in range(int(data.num_bodies)):
+        m, r = mass[body == b][:, None], pos[body == b]
+        r = r - (m * r).sum(dim=0) / m.sum()
+        own = force[body == b]
+        change, scale = m * predicted["elastomer"][body == b] - own, own.norm(dim=1).sum()
+        assert turning(r, own).norm() > 1e-3 * (r.norm(dim=1) * own.norm(dim=1)).sum()
+        assert change.sum(dim=0).norm() < 1e-6 * scale
+        assert turning(r, change).norm() < 1e-6 * (r.norm(dim=1).max() * scale)
+
+
 def with_loose_nodes(materials: tuple[str, ...] = ("elastomer",), gap: float = 0.5) -> State:
     """Return two touching bodies far from walls, each with a corner without cells, of masses that differ a hundredfold."""
     s = scenes.mesh_state("lattice", materials, num_bodies=2, gap=gap, walls=False)
@@ -145,9 +173,10 @@ def test_a_loose_node_moves_with_the_body_that_it_lies_beside_at_rest() -> None:
     kind = np.full(len(points), node_code("elastomer"), np.int64)
     kind[12] = node_code("sand")
     graph = multiscale_graph(rest, cells, scenes.SPACING, 2)
-    label = graph.moving_bodies(kind, scenes.SPACING)
+    label, bonds = graph.moving_bodies(kind, scenes.SPACING)
     groups = {frozenset(np.flatnonzero(label == b).tolist()) for b in np.unique(label[kind == node_code("elastomer")])}
     assert groups == {frozenset({0, 1, 2, 3, 8, 9}), frozenset({4, 5, 6, 7, 10}), frozenset({11}), frozenset({13})}
+    assert sorted(zip(*bonds.tolist(), strict=True)) == [(1, 8), (5, 10), (8, 9)]
 
 
 def prediction_and_parts(model: GPE, data: HeteroData) -> tuple[dict[str, torch.Tensor], Any]:

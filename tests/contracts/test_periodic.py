@@ -17,7 +17,7 @@ from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.statistics import combined, shard_moments
 from gpe_pl.data.validate import validate
-from gpe_pl.export.program import scene_of
+from gpe_pl.export.program import ExportedStep, scene_of
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity, PeriodicityError
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
 from gpe_pl.graphs.features import GraphConfig
@@ -35,6 +35,7 @@ from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.panel import Panel
 from tests import scenes
+from tests.contracts.test_contact import assert_newton_and_euler
 
 BOX = ((0.0, 1.0), (-0.5, 1.0), (0.25, 1.0))
 AXES = {"x": (True, False), "y": (False, True), "both": (True, True)}
@@ -236,6 +237,59 @@ def test_a_mesh_around_the_domain_is_refused() -> None:
     s = replace(s, pos=pos, rest_pos=pos, cells=cells, periodicity=space)
     with pytest.raises(GraphError, match="the mesh of node 0 goes around the periodic domain"):
         builder(space, ("elastomer",), mesh=True)(s.to_torch())
+
+
+def ring() -> tuple[GraphBuilder, State]:
+    """Return bodies that go around the domain together, the last beside the first; each is inside."""
+    s = scenes.mesh_state("lattice", num_bodies=3, gap=1.0, walls=False)
+    assert s.rest_pos is not None
+    low, high = float(s.rest_pos[:, 0].min()), float(s.rest_pos[:, 0].max())
+    space = Periodicity(((low - 0.5 * scenes.SPACING, high + 0.5 * scenes.SPACING), (-0.5, 1.0)), (True, False))
+    rng = np.random.default_rng(0)
+    s = replace(s, pos=s.rest_pos + 0.05 * scenes.SPACING * rng.normal(size=s.pos.shape), periodicity=space)
+    return builder(space, ("elastomer",), mesh=True), s
+
+
+def test_contacts_turn_bodies_that_go_around_the_domain_together() -> None:
+    """Also tests that the seam changes nothing, and the exported program."""
+    build, s = ring()
+    graph = build(s.to_torch())
+    assert int(graph.num_islands) == 1 and int(graph.num_bodies) == 3 and not graph["elastomer"].pos.any()
+    assert_newton_and_euler(build, s)
+    simulator = LearnedSimulator(GPE(build.spec, decoder="contact", num_message_passing_steps=1, hidden_channels=8), build).eval()
+    simulator.acceleration_std.fill_(30.0)
+    state = s.to_torch()
+    with torch.no_grad():
+        after = simulator.step(state)
+        for shift in shifts(s.periodicity):
+            moved = simulator.step(shifted(s, shift).to_torch())
+            torch.testing.assert_close(moved.vel, after.vel, rtol=0, atol=1e-4 * float((after.vel - state.vel).abs().max()))
+        later, _ = ExportedStep(simulator)(scene_of(simulator, state))
+    torch.testing.assert_close(later["velocity_history.elastomer"][:, -1], after.vel[graph["elastomer"].node_id], rtol=0, atol=1e-6)
+
+
+def test_levers_of_bodies_have_gradients() -> None:
+    build, s = ring()
+    pos = torch.from_numpy(s.pos).requires_grad_()
+    with_gradient = build(replace(s.to_torch(), pos=pos))["elastomer"].body_arm
+    torch.testing.assert_close(with_gradient.detach(), build(s.to_torch())["elastomer"].body_arm)
+    (grad,) = torch.autograd.grad(with_gradient[0, 0], pos)
+    assert float(grad[:, 0].max()) > 0.5 and float(grad.sum()) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_loose_node_at_the_seam_stays_beside_its_body() -> None:
+    space = torus((True, False))
+    build, s = builder(space, ("elastomer",), mesh=True), scenes.mesh_state("lattice", num_bodies=2, gap=3.0, walls=False)
+    assert s.cells is not None and s.rest_pos is not None
+    cells, rest = s.cells[~(s.cells == s.cells[0, 0]).any(axis=1)], s.rest_pos
+    s = replace(s, periodicity=space, cells=cells)
+    whole = build(s.to_torch())["elastomer"]
+    assert len(np.setdiff1d(np.arange(s.num_nodes), cells))
+    for shift in shifts(space):
+        folded = replace(shifted(s, shift), rest_pos=space.wrapped(rest + 0.7 * shift))
+        found = build(folded.to_torch())["elastomer"]
+        assert torch.equal(found.body, whole.body)
+        torch.testing.assert_close(found.body_arm, whole.body_arm, rtol=0, atol=1e-6)
 
 
 # --- shift ---------------------------------------------------------------------------------------------------------------------------------

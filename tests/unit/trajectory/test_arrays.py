@@ -15,7 +15,7 @@ import pytest
 from gpe_pl.data.importers import ImportFailure, assemble, save_dataset
 from gpe_pl.data.validate import validate
 from gpe_pl.geometry.periodicity import Periodicity, PeriodicityError
-from gpe_pl.geometry.shapes import domain_walls
+from gpe_pl.geometry.shapes import Box, domain_walls
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.trajectory.arrays import ArrayError, estimated_normals, typical_spacing
 from gpe_pl.trajectory.boundary import Boundary
@@ -208,6 +208,21 @@ def test_a_boundary_of_points() -> None:
     np.testing.assert_allclose(b.friction, [0.1, 0.2])
     assert (b.restitution == 0).all()
     assert (Boundary.from_numpy([[0.0, 0.0]], [[0, 1]]).friction == STICKY).all()
+
+
+def test_shapes_are_those_of_all_boundary_points() -> None:
+    """Otherwise the elastic law and containment see no wall where there are points only."""
+    walls, box = domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.3), Box((0.4, 0.2), (0.6, 0.4), 0.3)
+    sampled = Boundary.sample((*walls, box), 0.05, 2)
+    for shapes in ((*walls, box), ()):
+        given = Boundary.from_numpy(sampled.pos, sampled.normal, shapes=shapes)
+        assert trajectory(boundary=given).boundary.shapes == shapes
+    part = Boundary.from_numpy(sampled.pos, sampled.normal, shapes=walls)
+    with pytest.raises(
+        ArrayError,
+        match=r"boundary shapes: boundary_node \d+ is 0.4 m from the surface of every shape; give the shapes of all walls, or none",
+    ):
+        trajectory(boundary=part)
 
 
 def test_boundary_points_given_as_integers_are_positions() -> None:
