@@ -267,6 +267,7 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
         OmegaConf.resolve(cfg)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(explain(error, config_name, [*overrides])) from None
+    _check_top_level(cfg, config_name)
     return cfg
 
 

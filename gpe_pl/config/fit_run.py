@@ -144,8 +144,9 @@ class FitRun:
 
     @property
     def is_evaluated(self) -> bool:
-        """Whether the run was finished by an earlier start."""
-        return self._metrics.exists()
+        """Whether the run was finished by an earlier start, with all files that this one asks for."""
+        wanted = [self.folder / f"quantities_{split}.csv" for split in self.evaluation.splits if self.evaluation.quantities]
+        return self._metrics.exists() and all(path.exists() for path in wanted)
 
     def check_evaluation(self) -> None:
         """Check before training that the evaluated splits have trajectories that are long enough."""

@@ -153,7 +153,7 @@ class CommandLauncher(Launcher):
             The results of the jobs in order. A failed job has a ``SweepError`` about all failures, which is raised when its value is accessed.
 
         Raises:
-            UsageError: the configuration of a run is wrong; the remaining jobs are not run.
+            UsageError: two runs have the same folder, or the configuration of a run is wrong; the remaining jobs are not run.
             SweepError: the sweep was interrupted.
         """
         from rich.console import Console
@@ -162,6 +162,12 @@ class CommandLauncher(Launcher):
 
         setup_globals()
         jobs = [self._job(initial_job_idx + k, overrides) for k, overrides in enumerate(job_overrides)]
+        names = [job.name for job in jobs]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            alike = [" ".join(job.overrides) for job in jobs if job.name == twice]
+            raise UsageError(
+                f"two runs would have the same folder {one_line(twice)}: {one_line(alike[0])}, and {one_line(alike[1])}; leave one of them out"
+            )
         module = sys.modules["__main__"].__spec__
         assert module is not None, "a sweep is started by python -m"
         console = Console(highlight=False, soft_wrap=True, markup=False)

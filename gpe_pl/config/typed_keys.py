@@ -69,17 +69,19 @@ def _conditions(key: str) -> list[Condition]:
 
 
 def _is_in_lookup(key: str) -> bool:
-    """Whether a key belongs to a lookup table."""
+    """Whether a key belongs to a lookup table, or is one of the values of a size that other settings take."""
     parts = key.split(".")
+    if len(parts) == 2 and parts[0] == "size":
+        return parts[1] not in ("name", *LOOKUPS)
     return len(parts) > 2 and parts[0] in ("data", "size") and parts[1] in LOOKUPS
 
 
 def _is_read(cfg: DictConfig, key: str) -> bool:
-    """Whether another setting uses this entry of a lookup table. In that case, the configuration cannot be resolved without the entry."""
+    """Whether another setting uses this entry. In that case, the configuration cannot be resolved without the entry."""
     without = copy.deepcopy(cfg)
-    group, table, entry = key.split(".")[:3]
+    *table, entry = key.split(".")[:3]
     OmegaConf.set_struct(without, False)
-    del without[group][table][entry]
+    del OmegaConf.select(without, ".".join(table))[entry]
     try:
         OmegaConf.resolve(without)
     except OmegaConfBaseException:

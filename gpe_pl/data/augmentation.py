@@ -81,6 +81,14 @@ class Augmentation:
                 "training.rotate, quarter_turns and boost_speed: not in periodic domains, which stay as they are; leave them off"
             )
 
+    def is_idle(self, beginnings: Iterable[Trajectory]) -> bool:
+        """Return whether mirror images or velocities are wanted and no scene has a level axis for them, as with gravity that is not along an axis.
+
+        Args:
+            beginnings: first frames of trajectories, which are read if images need a level axis.
+        """
+        return (self.mirror or self.boost_speed > 0) and not any(_level(trajectory) for trajectory in beginnings)
+
     def hidden_pull(self, beginnings: Iterable[Trajectory]) -> list[int]:
         """Return the axes that images turn over although nodes accelerate along them, as where data store no gravity but have some.
 

@@ -375,6 +375,11 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         if augmentation.is_beyond_mirror:
             for stored in trajectories:
                 augmentation.check(stored.window(0, 1))
+        if augmentation.is_idle(stored.window(0, 1) for stored in trajectories[:LOOKED_AT]):
+            log.warning(
+                "training.mirror, training.boost_speed: they change no window, as no axis is level: gravity is not along an axis, or walls face one way "
+                "along every axis; leave these settings off"
+            )
         if pulled := augmentation.hidden_pull(stored.window(0, LOOKED_AT) for stored in trajectories[:LOOKED_AT]):
             axes = " and ".join("xyz"[axis] for axis in pulled)
             log.warning(
@@ -481,7 +486,7 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             trajectory.boundary.at(history),
             gravity,
             past,
-            (stored.phase / stored.stride + frame) * dt,
+            trajectory.start_time + history * dt,
             trajectory.rest_pos,
             trajectory.cells,
             cell_dim=trajectory.cell_dim,

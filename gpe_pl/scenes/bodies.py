@@ -64,30 +64,31 @@ class Nodes:
 def discretised(body: Body, spacing: float, density: float, rng: np.random.Generator) -> Nodes:
     """Fill a body with nodes: solids with a mesh, elastomers with a regular lattice and its cells, other materials with a jittered lattice.
 
+    The distances of a lattice differ from the spacing so far that a whole number of nodes fills the sides of the body.
+
     Raises:
         BodyFault: the body is thinner than the spacing, has too many nodes, or its outline cannot be meshed.
     """
     dim = len(body.low)
     if body.material == "solid":
         return _meshed(body, spacing, density, rng)
-    count = np.floor((body.high - body.low) / spacing + 1e-6).astype(int)
-    if (count < 1).any():
+    count = np.maximum(1, np.round((body.high - body.low) / spacing)).astype(int)
+    if (body.high - body.low < (1 - 1e-6) * spacing).any():
         raise BodyFault(f"{body.name}: is {min(body.high - body.low):g} m thin, less than the distance of nodes, {spacing:g} m")
     if np.prod(count.astype(float)) > MOST_NODES:
         raise BodyFault(
             f"{body.name}: would have {np.prod(count.astype(float)):.3g} nodes {spacing:g} m apart, at most {MOST_NODES:,}; make it smaller"
         )
     sites = np.stack(np.meshgrid(*[np.arange(n) for n in count], indexing="ij"), axis=-1).reshape(-1, dim)
-    margin = (body.high - body.low - count * spacing) / 2
-    margin[-1] = 0.0  # the lowest nodes are half a spacing above the lowest side
-    centre = body.low + margin + spacing * (sites + 0.5)
+    distance = (body.high - body.low) / count
+    centre = body.low + distance * (sites + 0.5)
     inside = body.contains(centre)
     if not inside.any():
         raise BodyFault(f"{body.name}: has no node, as nodes are {spacing:g} m apart; make it larger")
     is_meshed = body.material in MESHED
     cells = lattice_cells(sites[inside]) if is_meshed else np.empty((0, dim + 1), dtype=np.int64)
-    pos = centre[inside] + (0.0 if is_meshed else spacing * rng.uniform(-JITTER, JITTER, (int(inside.sum()), dim)))
-    return Nodes(pos, np.full(len(pos), density * spacing**dim), cells)
+    pos = centre[inside] + (0.0 if is_meshed else distance * rng.uniform(-JITTER, JITTER, (int(inside.sum()), dim)))
+    return Nodes(pos, np.full(len(pos), density * distance.prod()), cells)
 
 
 def _meshed(body: Body, spacing: float, density: float, rng: np.random.Generator) -> Nodes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,6 +11,7 @@ from typing import Any
 
 import torch
 
+from gpe_pl.geometry.shapes import thickness
 from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.training_ranges import stored_ranges
@@ -21,6 +23,11 @@ from gpe_pl.system.compiled import unfused
 from gpe_pl.system.progress import progress_bar
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+
+log = logging.getLogger(__name__)
+
+FEWEST_CELLS = 2
+"""Thickness of an obstacle [grid cells] from which on the material point method feels both its faces."""
 
 QUICK = 200_000
 """Node-frames up to which a rollout takes seconds without compiled passes. Compiling them takes longer, once for each version of the package."""
@@ -83,10 +90,26 @@ def predicted(simulator: LearnedSimulator, state: State, metadata: Metadata, num
 
 
 def solved(solver: Any, state: State, metadata: Metadata, num_frames: int, label: str) -> Trajectory:
-    """Roll a solver out from a state. Its frames may be shorter than those of ``metadata`` by a whole number; the result has those of ``metadata``."""
+    """Roll a solver out from a state. Its frames may be shorter than those of ``metadata`` by a whole number; the result has those of ``metadata``.
+
+    A warning is logged for obstacles that the material point method does not resolve.
+    """
+    _warn_of_thin_obstacles(solver, state)
     stride = max(1, round(metadata.frame_dt / solver.frame_dt))
     stored = replace(metadata, frame_dt=solver.frame_dt, solver=solver.name, solver_version=solver.version, solver_dt=solver.solver_dt)
     steps = math.ceil(num_frames * stride)
     with progress_bar(label) as on_progress:
         found = rollout(solver, state, steps, stored, guard_of(metadata), lambda frame, _: on_progress(frame, steps))
     return found.every(stride) if stride > 1 else found
+
+
+def _warn_of_thin_obstacles(solver: Any, state: State) -> None:
+    spacing = getattr(solver, "grid_spacing", None) if solver.name == "mpm" else None
+    for shape in state.boundary.shapes if spacing else ():
+        if (cells := thickness(shape) / spacing) < FEWEST_CELLS * (1 - 1e-6):
+            log.warning(
+                "solver mpm: an obstacle (%s) is %.2g cells of the grid thick; with fewer than %d, what touches it depends on its place in the grid",
+                shape.kind,
+                cells,
+                FEWEST_CELLS,
+            )

@@ -241,10 +241,14 @@ def train(
     """
     datamodule.push_forward = training.push_forward  # known only now, as it depends on the number of steps within a time budget
     interruption = Interruption()
-    shortest = min(t.num_frames for t in datamodule.val_trajectories(1))
-    steps = min(training.val_rollout_steps, shortest - datamodule.builder.config.history - 1)
+    validated = datamodule.val_trajectories(training.num_val_rollouts)
+    lengths = [min(training.val_rollout_steps, t.num_frames - datamodule.builder.config.history - 1) for t in validated]
+    if min(lengths) < max(lengths):
+        log.warning(
+            "validation rollouts have %d to %d frames, because scenes of the split val have unlike lengths", min(lengths), max(lengths)
+        )
     averages = [] if training.ema_decay is None else [WarmAverage(training.ema_decay)]
-    validation = RolloutValidation(datamodule.val_trajectories(training.num_val_rollouts), steps, training.val_containment)
+    validation = RolloutValidation(validated, max(lengths), training.val_containment)
     checkpoints = Checkpoints(run_dir / "checkpoints", 60 * trainer_settings.checkpoint_minutes, interruption, validation, starts_trained)
     own: list[Callback] = [
         validation,

@@ -109,6 +109,16 @@ def test_values_of_good_jobs_are_there_though_others_failed(monkeypatch: pytest.
             _ = failed.return_value
 
 
+def test_two_runs_with_the_same_folder_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second would find the results of the first, and count as done."""
+    launcher = Fixed(a=ValueError("no"))
+    monkeypatch.setattr(launcher, "_job", lambda number, overrides: Job([*overrides, f"trainer={number}"], Path("sweep"), "same"))
+    launcher.ends |= {"b": ValueError("no")}
+    with pytest.raises(UsageError, match="two runs would have the same folder same: a trainer=0, and b trainer=1; leave one of them out"):
+        launched(launcher, monkeypatch)
+    assert launcher.ended == 0
+
+
 def test_a_wrong_configuration_ends_a_sweep(monkeypatch: pytest.MonkeyPatch) -> None:
     launcher = Fixed(a=UsageError("key=3: must be 4"), b=ValueError("no"))
     with pytest.raises(UsageError, match="key=3: must be 4"):

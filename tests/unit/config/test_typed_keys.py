@@ -38,11 +38,14 @@ def unresolved(*overrides: str, hydra_config: bool = False) -> DictConfig:
         ("data=imported", "dimension=3", "data.size=imported"),
         ("model=gns", "size.comparison.budget_minutes=3", "no other setting"),
         ("experiment=table1", "size.comparison.tuning_minutes=3", "no other setting"),
+        ("experiment=smoke", "size.num_steps=500", "no other setting"),
+        ("model=cconv", "size.num_message_passing_steps=9", "no other setting"),
+        ("model=gpe", "+size.channels=9", "no other setting"),
     ],
 )
 def test_what_nothing_reads_is_refused(beside: str, typed: str, because: str) -> None:
     refusal = without_effect(unresolved(beside, typed), [beside, typed])
-    assert refusal.startswith(f"{typed}: has no effect") and because in refusal
+    assert refusal.startswith(f"{typed.lstrip('+')}: has no effect") and because in refusal
 
 
 def test_what_only_unread_keys_read_is_refused() -> None:
@@ -60,6 +63,8 @@ def test_what_only_unread_keys_read_is_refused() -> None:
         ("experiment=table1", "size.comparison.seeds='0'"),
         ("experiment=larger_scenes", "data.larger.solver.bounds=[[0,3],[0,1]]"),
         ("model=gpe", "training.num_steps=77"),
+        ("model=gpe", "size.num_steps=77"),
+        ("model=gns", "size.hidden_channels=77"),
         ("model=gpe", "graph.num_levels=2"),
         ("experiment=tuning_push", "training.push_correction=0.2"),
     ],

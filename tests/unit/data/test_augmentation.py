@@ -210,6 +210,14 @@ def test_gravity_that_is_not_stored_is_noticed(
     assert not caplog.text
 
 
+@pytest.mark.parametrize("augmentation", [Augmentation(mirror=True), Augmentation(boost_speed=1.0)])
+def test_images_without_a_level_axis_are_named(truth: Trajectory, caplog: pytest.LogCaptureFixture, augmentation: Augmentation) -> None:
+    windows(under(truth, gravity=(0.0, -9.81, 0.0)), augmentation)
+    assert not caplog.text
+    windows(under(truth, gravity=(1.0, -9.0, 2.0)), augmentation)
+    assert "they change no window, as no axis is level" in caplog.text
+
+
 def test_scenes_without_the_symmetry_are_refused(truth: Trajectory) -> None:
     with pytest.raises(AugmentationError, match=r"training.rotate=true: needs scenes in 3D"):
         Augmentation(rotate=True).check(under(truth, gravity=(1.0, 0.0, -9.0)))

@@ -74,6 +74,16 @@ def test_windows_of_longer_frames_have_the_time_of_their_frame(data: WindowDatas
         assert start.state.time == pytest.approx(whole.state(frame, HISTORY).time)
 
 
+@pytest.mark.parametrize("stride", [1, 2])
+def test_windows_of_a_trajectory_that_begins_later_have_the_time_of_the_scene(tmp_path: Path, trajectory: Trajectory, stride: int) -> None:
+    later = dataset(tmp_path, [trajectory.frames(7)])
+    view = [replace(stored, stride=stride) for stored in later.trajectories]
+    windows = WindowDataset(view, GraphBuilder(GraphConfig(history=HISTORY), view[0].window(0, 1).metadata), None, 0.1)
+    start = windows[StartKey(0, 0, 1)]
+    assert isinstance(start, UnrollStart)
+    assert start.state.time == pytest.approx((7 + HISTORY * stride) * DT)
+
+
 def test_targets_are_those_of_nodes_that_stay_and_that_no_opening_moves(data: WindowDataset, trajectory: Trajectory) -> None:
     assert trajectory.alive is not None
     left_out = set()
