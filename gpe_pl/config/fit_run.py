@@ -156,6 +156,8 @@ class FitRun:
     def finished_model(self) -> Path | None:
         """Copy the best checkpoint of a finished run with the same training from the sweep that ``reuse`` names. Return the copy, or None."""
         best = None if self.cfg.reuse is None else adopt(self.runs / self.cfg.reuse, self._trained, self.folder)
+        if self.cfg.reuse is not None and best is None:
+            log.info("reuse=%s: no finished run there has the same training; this run is trained", self.cfg.reuse)
         if best is not None:
             end_later_processes()
         return best
