@@ -392,7 +392,17 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
             check_settings(unroll_steps, solver is not None, augmentation != Augmentation())
         self.velocity_unit, self.seed = velocity_unit, seed
         self.probability: np.ndarray | None = None
-        self.ends = np.cumsum(window_counts(trajectories, builder.config.history, unroll_steps))
+        counts = window_counts(trajectories, builder.config.history, unroll_steps)
+        self.ends = np.cumsum(counts)
+        if short := counts.count(0):
+            frames = builder.config.history + unroll_steps + 1
+            log.warning(
+                "%s: %d of %d trajectories have fewer than %d frames and give no window",
+                trajectories[0].path.parent,
+                short,
+                len(counts),
+                frames,
+            )
         self._num_phases = 1 + max(t.phase for t in trajectories)
         self.scales = [] if builder.config.scales == "one" else [scale_of(stored) for stored in trajectories]
         self.velocity_units: Mapping[Scale, float] = {}

@@ -128,11 +128,14 @@ def test_windows_read_from_disk_equal_held_ones(store: Path) -> None:
         assert_equal_graphs(held[k + 5, k], read[k + 5, k])
 
 
-def test_trajectories_that_are_too_short_are_skipped(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> None:
+def test_trajectories_that_are_too_short_are_skipped(
+    tmp_path: Path, new_trajectory: Callable[..., Trajectory], caplog: pytest.LogCaptureFixture
+) -> None:
     lengths = (3, 6, 4, 5)
     write_shard(tmp_path / "train" / "shard-00000.h5", [new_trajectory(k, num_frames=n) for k, n in enumerate(lengths)])
     data = dataset(tmp_path, history=3)
     assert [data.locate(k) for k in range(len(data))] == [(1, 3), (1, 4), (3, 3)]
+    assert caplog.messages == [f"{tmp_path / 'train'}: 2 of 4 trajectories have fewer than 5 frames and give no window"]
     with pytest.raises(StoreError, match=r"no trajectory has the 7 frames that a start at frame 5 needs .*; the longest has 6"):
         dataset(tmp_path, history=5)
 
