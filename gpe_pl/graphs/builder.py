@@ -172,6 +172,8 @@ class GraphBuilder:
             raise GraphError(
                 f"state is periodic along {other}, the data set {self.metadata.dataset!r} along {own}; make the state with the same periodic axes"
             )
+        if state.loads is not None and state.loads.force is not None and "force" not in self.spec.loads:
+            raise GraphError("state has nodal forces, and the data set has none, so that a model would ignore them; leave them out")
         if self.spec.reads_stress and state.stress is None:
             raise GraphError(
                 "graph.stress=true: the state has no stress; give that of the first frame, zeros for a body at rest and undeformed"

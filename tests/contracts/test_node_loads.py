@@ -16,6 +16,7 @@ from gpe_pl.data.importers import save_dataset
 from gpe_pl.data.noise import Noise
 from gpe_pl.export.program import NodeLoadError, export_model
 from gpe_pl.graphs.batching import batched
+from gpe_pl.graphs.builder import GraphError
 from gpe_pl.learned.approximate import Sleeping
 from gpe_pl.learned.simulator import LearnedSimulator, SceneError
 from gpe_pl.metrics.rollouts import rollout_metrics
@@ -352,6 +353,14 @@ def test_a_model_refuses_loads_that_its_data_did_not_have() -> None:
     made = simulator(beam(held=False))
     with pytest.raises(SceneError, match="trained .* on elastomer with nodal forces; .* elastomer with prescribed nodes, nodal forces"):
         made.initial_state(beam(), 2)
+
+
+def test_a_model_without_forces_refuses_states_with_forces() -> None:
+    made, forced = simulator(beam(forced=False)), beam()
+    state = forced.state(2, made.builder.config.history).to_torch()
+    with pytest.raises(GraphError, match="state has nodal forces, and the data set has none, so that a model would ignore them"):
+        made.step(state)
+    made.step(beam(forced=False).state(2, made.builder.config.history).to_torch())
 
 
 def test_a_model_of_clamps_refuses_rollers() -> None:
