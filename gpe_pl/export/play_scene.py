@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.export.play_model import PageError
-from gpe_pl.export.program import refuse_openings, refuse_rigid_bodies
+from gpe_pl.export.program import refuse_loads, refuse_openings, refuse_rigid_bodies
 from gpe_pl.geometry.shapes import Shape
 from gpe_pl.trajectory.boundary import Boundary, as_numpy
 from gpe_pl.trajectory.state import State
@@ -47,9 +47,11 @@ def state_for_page(state: State, columns: list[int]) -> dict[str, Any]:
         PageError: the page does not know a wall or obstacle, walls move, or have points only.
         RigidBodyError: the state has rigid bodies.
         OpenSceneError: the state has inlets or outlets.
+        NodeLoadError: the state has prescribed nodes or forces.
     """
     refuse_rigid_bodies(state.rigid_body)
     refuse_openings(state)
+    refuse_loads(state)
     check_boundary(state.boundary)
     history = state.vel[:, None] if state.velocity_history is None else state.velocity_history
     return {

@@ -245,6 +245,12 @@ def refuse_openings(state: State) -> None:
         )
 
 
+def refuse_loads(state: State) -> None:
+    """Raise ``NodeLoadError`` if a state has prescribed nodes or forces."""
+    if state.loads is not None:
+        raise NodeLoadError("exported programs and pages have no prescribed nodes and no forces; roll the scene out with this package")
+
+
 def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
     """Return the tensors that a program of this simulator takes, for a state with velocity history.
 
@@ -254,6 +260,7 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
     """
     refuse_rigid_bodies(state.rigid_body)
     refuse_openings(state)
+    refuse_loads(state)
     builder, spec = simulator.builder, simulator.builder.spec
     topology = replace(builder, config=replace(builder.config, trim_boundary=False)).topology(state)
     mesh, islands = topology.mesh, topology.islands

@@ -208,7 +208,8 @@ class _Repeated:
 
 
 class Repeating(Batched):
-    """Simulator that predicts once in ``frames`` frames and repeats the accelerations in between. Contacts that begin or end in between have no effect.
+    """Simulator that predicts once in ``frames`` frames and repeats the accelerations in between. Contacts that begin or end in between have no effect,
+    and the impulse of an impact acts as often, so the energy can grow.
 
     Args:
         simulator: simulator that predicts.

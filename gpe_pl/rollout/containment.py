@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from array_api_compat import array_namespace, device
@@ -16,6 +18,8 @@ from gpe_pl.system.compiled import is_wanted
 from gpe_pl.trajectory.boundary import Array, as_numpy
 from gpe_pl.trajectory.rigid_bodies import bodies_of
 from gpe_pl.trajectory.state import State
+
+log = logging.getLogger(__name__)
 
 
 def contain(state: State, dt: float) -> tuple[State, Array]:
@@ -127,6 +131,14 @@ def _on_surfaces(shapes: tuple[Shape, ...], points: Array, tolerance: float) -> 
     return points
 
 
+@cache
+def _warn_of_points() -> None:
+    """Warn, once in a process, of walls without shapes."""
+    log.warning(
+        "containment: walls that are points only, and walls that move, have no shape, so nodes that cross them are neither put back nor counted"
+    )
+
+
 @dataclass(frozen=True)
 class Contained:
     """A simulator with containment after every step. ``State.num_corrected`` of a new state is the number of corrected nodes.
@@ -156,6 +168,8 @@ class Contained:
         return [self._contain(item) if isinstance(item, State) else item for item in step_all(self.simulator, states)]
 
     def _contain(self, state: State) -> State:
+        if len(state.boundary.pos) and not state.boundary.shapes:
+            _warn_of_points()
         contained, corrected = contain(state, self.dt)
         num_corrected = 0 if contained is state else int(corrected.sum())
         return contained if num_corrected == state.num_corrected else replace(contained, num_corrected=num_corrected)

@@ -29,7 +29,7 @@ class Skips:
             models move nodes by 0.01 to 0.03 spacings.
         rest_step_change_spacings: a node is at rest only if its displacement in a frame differs from that in the frame before by less than this distance [rest
             spacings].
-        repeat_frames: approximate. Number of frames for which one prediction is repeated.
+        repeat_frames: approximate. Number of frames for which one prediction is repeated. An impact is repeated, too, so the energy can grow.
     """
 
     absent_types: bool = True

@@ -12,6 +12,7 @@ import numpy as np
 from array_api_compat import array_namespace, device
 
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
+from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -62,6 +63,16 @@ class Isometry(Protocol):
             motion=motion,
         )
 
+    def openings(self, openings: tuple[Opening, ...]) -> tuple[Opening, ...]:
+        """Return the images of inlets and outlets.
+
+        Raises:
+            ValueError: there are some, and the map turns them.
+        """
+        if openings:
+            raise ValueError("inlets and outlets lie along the axes, so they cannot be turned")
+        return openings
+
     def state(self, state: State, boundary: Boundary) -> State:
         """Return the image of a state, given that of its boundary. ``periodicity`` and ``internal`` stay as they are."""
         history, rest_pos, stress, loads = state.velocity_history, state.rest_pos, state.stress, state.loads
@@ -78,6 +89,7 @@ class Isometry(Protocol):
             stress=None if stress is None else self._stress(stress),
             boundary=boundary,
             loads=loads,
+            openings=self.openings(state.openings),
         )
 
     def trajectory(self, trajectory: Trajectory) -> Trajectory:
@@ -124,6 +136,18 @@ class Reflection(Isometry):
     def point(self, x: Array) -> Array:
         """Return the images of positions [..., dim] in m."""
         return self.vector(x) + _row([0.0 if plane is None else 2 * plane for plane in self.planes], x)
+
+    def openings(self, openings: tuple[Opening, ...]) -> tuple[Opening, ...]:
+        """Return the images of inlets and outlets, with their sides."""
+        return tuple(map(self._opening, openings))
+
+    def _opening(self, opening: Opening) -> Opening:
+        ends = np.sort([self.point(np.array(corner, np.float64)) for corner in (opening.low, opening.high)], axis=0)
+        side = opening.side
+        if self.planes[opening.axis] is not None:
+            axis, _, end = side.partition("_")
+            side = f"{axis}_{'high' if end == 'low' else 'low'}"
+        return replace(opening, low=tuple(ends[0].tolist()), high=tuple(ends[1].tolist()), side=side)
 
     def tensor(self, x: Array) -> Array:
         """Return the images of stresses [..., component], in the order of ``schema.STRESS_COMPONENTS``. Some shears change sign."""

@@ -14,7 +14,8 @@ import torch
 from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.data.importers import save_dataset
 from gpe_pl.data.noise import Noise
-from gpe_pl.export.program import NodeLoadError, export_model
+from gpe_pl.export.play_scene import state_for_page
+from gpe_pl.export.program import NodeLoadError, export_model, scene_of
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphError
 from gpe_pl.learned.approximate import Sleeping
@@ -361,6 +362,15 @@ def test_a_model_without_forces_refuses_states_with_forces() -> None:
     with pytest.raises(GraphError, match="state has nodal forces, and the data set has none, so that a model would ignore them"):
         made.step(state)
     made.step(beam(forced=False).state(2, made.builder.config.history).to_torch())
+
+
+def test_exported_scenes_have_no_loads() -> None:
+    """A program would leave prescribed nodes to the model."""
+    made = simulator(beam(forced=False, held=False))
+    state = beam(forced=False).state(2, made.builder.config.history).to_torch()
+    for refuses in (lambda: scene_of(made, state), lambda: state_for_page(state, [0])):
+        with pytest.raises(NodeLoadError, match="no prescribed nodes and no forces"):
+            refuses()
 
 
 def test_a_model_of_clamps_refuses_rollers() -> None:

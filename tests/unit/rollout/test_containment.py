@@ -22,6 +22,8 @@ from gpe_pl.geometry.shapes import (
     signed_distance,
     surface_tolerance,
 )
+from gpe_pl.rollout import containment
+from gpe_pl.rollout.baselines import ConstantVelocity
 from gpe_pl.rollout.containment import Contained, contain
 from gpe_pl.system.compiled import unfused
 from gpe_pl.trajectory.boundary import Boundary
@@ -254,3 +256,15 @@ def test_shapes_that_nothing_is_in_are_skipped_without_a_difference(shapes: tupl
     np.testing.assert_array_equal(
         result.pos[corrected], np.where(caught[:, None], after[corrected] - state.vel[corrected] * DT, everywhere)
     )
+
+
+def test_walls_without_shapes_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    """They hold no node, and no node is counted."""
+    containment._warn_of_points.cache_clear()
+    floor = Boundary.from_numpy(np.stack([np.linspace(0, 1, 21), np.zeros(21)], axis=1), np.tile([0.0, 1.0], (21, 1)))
+    state = State(np.array([[0.5, 0.01]]), np.array([[0.0, -1.0]]), np.zeros(1, np.uint8), np.ones(1), np.ones((1, 1)), floor, np.zeros(2))
+    contained = Contained(ConstantVelocity(0.1), 0.1)
+    for _ in range(2):
+        after = contained.step(state)
+    assert after.pos[0, 1] < 0 and after.num_corrected == 0
+    assert len([m for m in caplog.messages if "nodes that cross them are neither put back nor counted" in m]) == 1

@@ -13,9 +13,11 @@ import pytest
 from gpe_pl.data.validate import validate
 from gpe_pl.schema import FIELDS
 from gpe_pl.trajectory.living import columns
-from gpe_pl.trajectory.openings import Opening, openings_fault
+from gpe_pl.trajectory.openings import Opening, carried, openings_fault
+from gpe_pl.trajectory.reflection import Reflection, Rotation
 from gpe_pl.trajectory.store import StoreError, read_trajectory, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
+from tests.open_scenes import BOUNDS, OPENINGS, open_state
 
 INLET = Opening((0.0, 0.0), (0.3, 0.2), "x_low", speed=0.5, spacing=0.1, node_type=0, mass=2.0, params=(30.0,))
 
@@ -169,3 +171,23 @@ def test_columns_keep_identities_and_the_nearest_values() -> None:
 def test_faults_of_openings_are_named(changes: dict[str, object], message: str) -> None:
     assert openings_fault([INLET], 2, 1, 5) is None
     assert openings_fault([replace(INLET, **changes)], 2, 1, 5) == f"opening 1: {message}"  # type: ignore[arg-type]
+
+
+def test_openings_are_mirrored_with_their_scene() -> None:
+    """Averages over mirror images need it: the graph of an image asks which nodes are in an opening."""
+    pos = np.random.default_rng(0).uniform(0.0, 1.0, (200, 2))
+    for axes in ([0], [1], [0, 1]):
+        mirror = Reflection.of(BOUNDS, axes)
+        images = mirror.openings(OPENINGS)
+        np.testing.assert_array_equal(carried(images, mirror.point(pos)), carried(OPENINGS, pos))
+        for opening, image in zip(OPENINGS, images, strict=True):
+            if opening.enters:
+                where = mirror.point(np.array(opening.nodes_at_start()))
+                np.testing.assert_allclose(sorted(where.tolist()), sorted(np.array(image.nodes_at_start()).tolist()), atol=1e-9)
+        again = mirror.openings(images)
+        assert [o.side for o in again] == [o.side for o in OPENINGS]
+        np.testing.assert_allclose([o.low for o in again], [o.low for o in OPENINGS], atol=1e-12)
+    state = open_state()
+    assert Reflection.of(BOUNDS, [0]).state(state, state.boundary).openings[0].side == "x_high"
+    with pytest.raises(ValueError, match="inlets and outlets lie along the axes, so they cannot be turned"):
+        Rotation.between_axes(1, [0.5, 0.5]).state(state, state.boundary)
