@@ -14,12 +14,14 @@ from gpe_pl.geometry.compiled_distance import distance_to, nearest_of, packed_sh
 
 NUM_PASSES = 4
 """Number of passes over all shapes that bring a point out of them: corners need a pass per surface."""
+FACING = -0.9
+"""A point on the surfaces of two shapes is between them, as under a box that stands on the floor, if the product of their normals is below this."""
 
 
 def put_back(
     shapes: tuple[Any, ...], pos: np.ndarray, vel: np.ndarray, dt: float, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return positions [node, dim] without nodes deeper than ``tolerance`` [m] in a shape, as ``containment.contain``; None without such nodes.
+    """Return positions [node, dim] without nodes deeper than ``tolerance`` [m] in a shape or between two, as ``containment.contain``; None without such nodes.
 
     Args:
         shapes: shapes that ``packed_shapes`` knows.
@@ -42,19 +44,38 @@ def put_back(
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _find_inside(pos, kinds, starts, numbers, tolerance, inside):
-    """Mark the points deeper than ``tolerance`` in a shape; return their number."""
-    count = 0
+    """Mark the points deeper than ``tolerance`` in a shape, and those between two; return their number."""
+    count, normals = 0, np.empty((kinds.shape[0], pos.shape[1]))
     for n in range(pos.shape[0]):
-        inside[n] = nearest_of(pos[n], kinds, starts, numbers) < -tolerance
+        distance = nearest_of(pos[n], kinds, starts, numbers)
+        inside[n] = distance < -tolerance or (distance <= tolerance and _is_between(pos[n], kinds, starts, numbers, tolerance, normals))
         count += inside[n]
     return count
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
+def _is_between(x, kinds, starts, numbers, tolerance, normals):
+    """Return whether a point is on the surfaces of two shapes that face each other; ``normals`` [shape, dim] is overwritten."""
+    count = 0
+    for s in range(kinds.shape[0]):
+        if abs(distance_to(x, s, kinds, starts, numbers)) <= tolerance:
+            write_normal(x, s, kinds, starts, numbers, tolerance, normals[count])
+            for k in range(count):
+                product = 0.0
+                for a in range(x.shape[0]):
+                    product += normals[k, a] * normals[count, a]
+                if product < FACING:
+                    return True
+            count += 1
+    return False
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
 def _put_back(vel, dt, kinds, starts, numbers, tolerance, inside, new_pos, new_vel):
     dim = new_pos.shape[1]
-    x, normal = np.empty(dim), np.empty(dim)
+    x, normal, normals = np.empty(dim), np.empty(dim), np.empty((kinds.shape[0], dim))
     for n in range(new_pos.shape[0]):
         if not inside[n]:
             continue
@@ -69,7 +90,7 @@ def _put_back(vel, dt, kinds, starts, numbers, tolerance, inside, new_pos, new_v
                     write_normal(x, s, kinds, starts, numbers, tolerance, normal)
                     for a in range(dim):
                         x[a] += depth * normal[a]
-        is_caught = nearest_of(x, kinds, starts, numbers) < -tolerance
+        is_caught = nearest_of(x, kinds, starts, numbers) < -tolerance or _is_between(x, kinds, starts, numbers, tolerance, normals)
         for a in range(dim):
             if is_caught:
                 x[a] = new_pos[n, a] - vel[n, a] * dt

@@ -10,7 +10,7 @@ import numpy as np
 from array_api_compat import array_namespace, device
 
 from gpe_pl.geometry.compiled_distance import has_compiled_distance
-from gpe_pl.geometry.compiled_surfaces import NUM_PASSES, put_back
+from gpe_pl.geometry.compiled_surfaces import FACING, NUM_PASSES, put_back
 from gpe_pl.geometry.shapes import Shape, outward_normal, signed_distance, surface_tolerance
 from gpe_pl.rollout.ensemble import Ensemble
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
@@ -25,7 +25,8 @@ log = logging.getLogger(__name__)
 def contain(state: State, dt: float) -> tuple[State, Array]:
     """Move nodes inside a wall or obstacle back to its surface, along the normal. Depths up to ``geometry.shapes.surface_tolerance`` are allowed.
 
-    In a narrow gap between surfaces, a node may still be inside afterwards; it then returns to its position before the step. Velocities and the last entry of
+    In a narrow gap between surfaces, a node may still be inside afterwards; it then returns to its position before the step. So does a node between two
+    surfaces that face each other, such as the floor and the lower face of a box that stands on it. Velocities and the last entry of
     the velocity history change by displacement / ``dt``, so that they remain differences of positions. A rigid body moves as a whole, by the displacements of
     its deepest nodes.
 
@@ -77,12 +78,12 @@ def _contain_plainly(state: State, dt: float, tolerance: float) -> tuple[State, 
     """Return the results of ``contain`` by the methods of the shapes."""
     shapes, pos = state.boundary.shapes, state.pos
     xp = array_namespace(pos)
-    inside = signed_distance(shapes, pos) < -tolerance
+    inside = (signed_distance(shapes, pos) < -tolerance) | _are_between(shapes, pos, tolerance)
     if not bool(xp.any(inside)):
         return state, inside
     rows = xp.nonzero(inside)[0]
     moved = xp.asarray(_on_surfaces(shapes, _plain(pos[rows]), tolerance))
-    caught = signed_distance(shapes, moved) < -tolerance
+    caught = (signed_distance(shapes, moved) < -tolerance) | _are_between(shapes, moved, tolerance)
     moved = xp.where(caught[:, None], pos[rows] - state.vel[rows] * dt, moved)
     new_pos, vel = xp.asarray(pos, copy=True), xp.asarray(state.vel, copy=True)
     new_pos[rows] = state.periodicity.wrapped(moved)
@@ -115,6 +116,21 @@ def _contain_bodies(state: State, contained: State, inside: Array, dt: float) ->
 def _plain(points: Array) -> Array:
     """Return points on a CPU as a NumPy array, whose operations on few points take less time than PyTorch's."""
     return points if str(device(points)) != "cpu" or getattr(points, "requires_grad", False) else np.asarray(points)
+
+
+def _are_between(shapes: tuple[Shape, ...], points: Array, tolerance: float) -> Array:
+    """Return whether each point is on the surfaces of two shapes that face each other."""
+    xp = array_namespace(points)
+    between, on_before = xp.zeros(len(points), dtype=xp.bool, device=device(points)), []
+    for shape in shapes:
+        on = xp.abs(shape.signed_distance(points)) <= tolerance
+        if not bool(xp.any(on)):  # normals are expensive, and most shapes touch no node
+            continue
+        normal = outward_normal(shape, points, step=tolerance)
+        for other, other_normal in on_before:
+            between = between | (on & other & (xp.sum(normal * other_normal, axis=1) < FACING))
+        on_before.append((on, normal))
+    return between
 
 
 def _on_surfaces(shapes: tuple[Shape, ...], points: Array, tolerance: float) -> Array:

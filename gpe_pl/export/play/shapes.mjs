@@ -1,6 +1,6 @@
 // Walls and obstacles in 2D: signed distances, boundary nodes on surfaces, and containment, as in ``geometry.shapes`` and ``rollout.containment``.
 
-const ON_SURFACE = 1e-6, NUM_PASSES = 4;
+const ON_SURFACE = 1e-6, NUM_PASSES = 4, FACING = -0.9;
 
 const distances = {
   wall: (s, x, y) => (s.normal[0] ? x * s.normal[0] : y * s.normal[1]) - s.offset,
@@ -109,12 +109,19 @@ export function boundaryOf(shapes, spacing) {
 
 // --- containment ---------------------------------------------------------------------------------------------------------------------------------
 
+/** Return whether a point is on the surfaces of two shapes that face each other, as under a box that stands on the floor. */
+function isBetween(shapes, x, y, tolerance) {
+  const normals = shapes.filter((s) => Math.abs(distanceTo(s, x, y)) <= tolerance).map((s) => normalOf(s, x, y, tolerance));
+  return normals.some((a, k) => normals.slice(0, k).some((b) => a[0] * b[0] + a[1] * b[1] < FACING));
+}
+
 /** Move nodes inside a wall or obstacle back to its surface and change their velocities to match. Return their number. */
 export function contain(shapes, state, dt) {
   const tolerance = surfaceTolerance(shapes), { pos, vel } = state;
   let corrected = 0;
   for (let n = 0; n < state.count; n++) {
-    if (!(nearest(shapes, pos[2 * n], pos[2 * n + 1]) < -tolerance)) continue;
+    const distance = nearest(shapes, pos[2 * n], pos[2 * n + 1]);
+    if (!(distance < -tolerance || (distance <= tolerance && isBetween(shapes, pos[2 * n], pos[2 * n + 1], tolerance)))) continue;
     corrected++;
     let x = pos[2 * n], y = pos[2 * n + 1];
     for (let pass = 0; pass < NUM_PASSES && nearest(shapes, x, y) < 0; pass++) {
@@ -127,7 +134,7 @@ export function contain(shapes, state, dt) {
         }
       }
     }
-    if (nearest(shapes, x, y) < -tolerance) [x, y] = [0, 1].map((a) => pos[2 * n + a] - vel[2 * n + a] * dt);
+    if (nearest(shapes, x, y) < -tolerance || isBetween(shapes, x, y, tolerance)) [x, y] = [0, 1].map((a) => pos[2 * n + a] - vel[2 * n + a] * dt);
     [x, y].forEach((value, a) => {
       vel[2 * n + a] += (value - pos[2 * n + a]) / dt;
       pos[2 * n + a] = value;

@@ -251,7 +251,7 @@ def test_shapes_that_nothing_is_in_are_skipped_without_a_difference(shapes: tupl
         for shape in shapes:
             depth = np.maximum(-shape.signed_distance(everywhere), 0.0)
             everywhere = everywhere + depth[:, None] * outward_normal(shape, everywhere, step=1e-6)
-    caught = signed_distance(shapes, everywhere) < -TOLERANCE
+    caught = (signed_distance(shapes, everywhere) < -TOLERANCE) | containment._are_between(shapes, everywhere, TOLERANCE)
     assert corrected.sum() > 20
     np.testing.assert_array_equal(
         result.pos[corrected], np.where(caught[:, None], after[corrected] - state.vel[corrected] * DT, everywhere)
@@ -268,3 +268,36 @@ def test_walls_without_shapes_are_named(caplog: pytest.LogCaptureFixture) -> Non
         after = contained.step(state)
     assert after.pos[0, 1] < 0 and after.num_corrected == 0
     assert len([m for m in caplog.messages if "nodes that cross them are neither put back nor counted" in m]) == 1
+
+
+@pytest.mark.parametrize("backend", ["compiled", "numpy", "torch"])
+@pytest.mark.parametrize("height", [0.0, 0.001, 0.003, 0.02])
+@pytest.mark.parametrize("stacked", [False, True])
+def test_no_node_gets_under_a_box_that_stands_on_something(height: float, stacked: bool, backend: str) -> None:
+    """Both surfaces are there at distance zero, so the signed distance alone calls this free."""
+    walls = domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.0)
+    shapes: tuple[Shape, ...] = (*walls, Box((0.4, 0.0), (0.7, 0.3), 0.0))
+    if stacked:
+        shapes, height = (*walls, Box((0.4, -0.1), (0.7, 0.2), 0.0), Box((0.4, 0.2), (0.7, 0.5), 0.0)), 0.2 + height
+    pos, vel = np.array([[0.3, height]]), np.array([[0.5, 0.0]])
+    boundary = Boundary.sample(shapes, 0.05, 2)
+    state = State(pos, vel, np.zeros(1, np.uint8), np.ones(1), np.ones((1, 1)), boundary, np.zeros(2))
+    contained = Contained(ConstantVelocity(0.05), 0.05)
+    if backend == "torch":
+        state = state.to_torch()
+    for _ in range(12):
+        if backend == "compiled":
+            state = contained.step(state)
+        else:
+            with unfused():
+                state = contained.step(state)
+    assert float(state.pos[0, 0]) <= 0.4 + 1e-6
+    assert abs(float(state.vel[0, 0])) < 1e-6
+
+
+def test_a_node_at_the_foot_of_a_box_is_free() -> None:
+    walls = domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.0)
+    boundary = Boundary.sample((*walls, Box((0.4, 0.0), (0.7, 0.3), 0.0)), 0.05, 2)
+    for x in (0.4, 0.39, 0.7):
+        state = State(np.array([[x, 0.0]]), np.zeros((1, 2)), np.zeros(1, np.uint8), np.ones(1), np.ones((1, 1)), boundary, np.zeros(2))
+        assert contain(state, 0.05)[0] is state
