@@ -185,6 +185,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                 _check_device(cfg, typed)
                 construct(Paths, cfg.paths, "paths")
                 _check_top_level(cfg, config_name)
+                _check_name(cfg, config_name)
                 value = task(cfg)
                 if RESULT in os.environ:
                     replace_text(Path(os.environ[RESULT]), json.dumps(value))
@@ -303,6 +304,10 @@ def _check_top_level(cfg: DictConfig, config_name: str) -> None:
     wrong = {str(k) for k in cfg} ^ (known - (WITHOUT_KEY - set(file)))
     if wrong:
         raise ConfigError(f"{min(wrong)}: unknown or missing key{did_you_mean(min(wrong), known)}; valid keys: {', '.join(sorted(known))}")
+
+
+def _check_name(cfg: DictConfig, config_name: str) -> None:
+    file = OmegaConf.load(CONF / f"{config_name}.yaml")
     if "name" in cfg and OmegaConf.to_container(file)["name"] is not None:  # type: ignore[call-overload,index]
         try:
             run_name(cfg.name)

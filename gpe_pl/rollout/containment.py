@@ -121,7 +121,7 @@ def _plain(points: Array) -> Array:
 def _are_between(shapes: tuple[Shape, ...], points: Array, tolerance: float) -> Array:
     """Return whether each point is on the surfaces of two shapes that face each other."""
     xp = array_namespace(points)
-    between, on_before = xp.zeros(len(points), dtype=xp.bool, device=device(points)), []
+    between, on_before = xp.zeros(len(points), dtype=xp.bool, device=device(points)), list[tuple[Array, Array]]()
     for shape in shapes:
         on = xp.abs(shape.signed_distance(points)) <= tolerance
         if not bool(xp.any(on)):  # normals are expensive, and most shapes touch no node

@@ -105,7 +105,9 @@ def solved(solver: Any, state: State, metadata: Metadata, num_frames: int, label
 
 def _warn_of_thin_obstacles(solver: Any, state: State) -> None:
     spacing = getattr(solver, "grid_spacing", None) if solver.name == "mpm" else None
-    for shape in state.boundary.shapes if spacing else ():
+    if spacing is None:
+        return
+    for shape in state.boundary.shapes:
         if (cells := thickness(shape) / spacing) < FEWEST_CELLS * (1 - 1e-6):
             log.warning(
                 "solver mpm: an obstacle (%s) is %.2g cells of the grid thick; with fewer than %d, what touches it depends on its place in the grid",

@@ -236,19 +236,11 @@ def train(
         RunError: the accelerator or devices are not available, or training was interrupted; the message says how to resume.
         TrainingError: losses are not finite; the message names the last checkpoint.
         CheckpointError: training cannot resume from ``last.ckpt``.
-
-    A warning is logged if the training ends within its warm-up.
     """
     datamodule.push_forward = training.push_forward  # known only now, as it depends on the number of steps within a time budget
     interruption = Interruption()
-    validated = datamodule.val_trajectories(training.num_val_rollouts)
-    lengths = [min(training.val_rollout_steps, t.num_frames - datamodule.builder.config.history - 1) for t in validated]
-    if min(lengths) < max(lengths):
-        log.warning(
-            "validation rollouts have %d to %d frames, because scenes of the split val have unlike lengths", min(lengths), max(lengths)
-        )
     averages = [] if training.ema_decay is None else [WarmAverage(training.ema_decay)]
-    validation = RolloutValidation(validated, max(lengths), training.val_containment)
+    validation = _validation(datamodule, training)
     checkpoints = Checkpoints(run_dir / "checkpoints", 60 * trainer_settings.checkpoint_minutes, interruption, validation, starts_trained)
     own: list[Callback] = [
         validation,
@@ -259,13 +251,7 @@ def train(
     if trainer_settings.progress:
         own.append(StepProgress())
     trainer = _trainer(training, trainer_settings, loggers, run_dir, [*own, *callbacks])
-    if training.schedule == "cosine" and 0 < training.num_steps < training.warmup_steps:
-        log.warning(
-            "training.warmup_steps=%d: training ends at step %d, before the learning rate has reached training.learning_rate=%g",
-            training.warmup_steps,
-            training.num_steps,
-            training.learning_rate,
-        )
+    _warn_of_warmup(training)
     last = checkpoints.last if checkpoints.last.exists() else None
     if last is not None:
         log.info("resuming from %s", last)
@@ -297,6 +283,27 @@ def train(
             checkpoints.last,
         )
     return checkpoints.best
+
+
+def _validation(datamodule: TrajectoryDataModule, training: TrainingSettings) -> RolloutValidation:
+    """Return the validation by rollouts. Each has the length of its scene, if that is shorter than ``val_rollout_steps``."""
+    validated = datamodule.val_trajectories(training.num_val_rollouts)
+    lengths = [min(training.val_rollout_steps, t.num_frames - datamodule.builder.config.history - 1) for t in validated]
+    if min(lengths) < max(lengths):
+        log.warning(
+            "validation rollouts have %d to %d frames, because scenes of the split val have unlike lengths", min(lengths), max(lengths)
+        )
+    return RolloutValidation(validated, max(lengths), training.val_containment)
+
+
+def _warn_of_warmup(training: TrainingSettings) -> None:
+    if training.schedule == "cosine" and 0 < training.num_steps < training.warmup_steps:
+        log.warning(
+            "training.warmup_steps=%d: training ends at step %d, before the learning rate has reached training.learning_rate=%g",
+            training.warmup_steps,
+            training.num_steps,
+            training.learning_rate,
+        )
 
 
 def _trainer(

@@ -261,17 +261,14 @@ def _unit(normal: np.ndarray) -> np.ndarray:
     return np.asarray(normal / length)
 
 
-def check_on_surfaces(boundary: Boundary) -> None:
-    """Raise ``ArrayError`` if a boundary has shapes, but a node is farther from the surfaces of all of them than half the usual distance of nodes."""
+def has_nodes_beside_shapes(boundary: Boundary) -> bool:
+    """Return whether a boundary has shapes, but a node is farther from the surfaces of all of them than half the usual distance of nodes."""
     if not boundary.shapes or not len(boundary.pos):
-        return
+        return False
     pos = as_numpy(boundary.pos).astype(np.float64)
     distance = np.min([np.abs(shape.signed_distance(pos)) for shape in boundary.shapes], axis=0)
-    node, apart = int(distance.argmax()), float(np.median(nearest_distances(pos)))
-    if distance[node] > max(0.5 * apart, 1e-3 * float(np.ptp(pos, axis=0).max())):
-        raise ArrayError(
-            f"boundary shapes: boundary_node {node} is {distance[node]:.3g} m from the surface of every shape; give the shapes of all walls, or none"
-        )
+    apart = float(np.median(nearest_distances(pos)))
+    return bool(distance.max() > max(0.5 * apart, 1e-3 * float(np.ptp(pos, axis=0).max())))
 
 
 def check_steps(boundary: Boundary, frame_dt: float, periodicity: Periodicity) -> None:

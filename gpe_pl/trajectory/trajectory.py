@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -30,12 +31,22 @@ from gpe_pl.trajectory.arrays import (
     typical_spacing,
     velocities_of,
 )
-from gpe_pl.trajectory.boundary import Array, Boundary, check_on_surfaces, check_steps
+from gpe_pl.trajectory.boundary import Array, Boundary, check_steps, has_nodes_beside_shapes
 from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.living import held, living
 from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State, Stress
+
+log = logging.getLogger(__name__)
+
+
+@cache
+def _warn_of_missing_shapes() -> None:
+    """Warn, once in a process, of boundaries whose shapes are not all there."""
+    log.warning(
+        "boundary: some nodes are on none of the shapes; containment, pictures and the elastic law see shapes only; give the shapes of all walls, or none"
+    )
 
 
 @dataclass(frozen=True)
@@ -317,7 +328,8 @@ class Trajectory:
         periodicity = Periodicity(bounds, repeats)
         check_steps(boundary, frame_dt, periodicity)
         boundary = boundary.inside(periodicity)
-        check_on_surfaces(boundary)
+        if has_nodes_beside_shapes(boundary):
+            _warn_of_missing_shapes()
         if periodicity:
             pos = np.stack([periodicity.wrapped(frame.astype(np.float64)).astype(pos.dtype) for frame in pos])
         codes, columns, names, stored = checked_materials(materials, params, num_nodes)

@@ -139,7 +139,8 @@ class Panel:
         if frame < self.trajectory.num_frames:
             pos = self.trajectory.metadata.periodicity.wrapped(self.trajectory.pos[frame].astype(np.float64))
             self._show(pos, *self.coloring(self.trajectory, frame))
-            self.note.set(text=self._outside(pos), y=0.85)  # above most of the motion
+            self.note.set_text(self._outside(pos))
+            self.note.set_y(0.85)  # above most of the motion
             return
         self._show(np.full(self.trajectory.pos.shape[1:], np.nan), *self.coloring(self.trajectory, 0))
         self.note.set_y(0.5)

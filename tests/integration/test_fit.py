@@ -281,18 +281,6 @@ def _claimed(cfg: DictConfig) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_quantities_can_be_asked_for_afterwards(tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]]) -> None:
-    value = fit(tiny(tiny_data, tmp_path, *STEPS))
-    metrics = (tmp_path / "fit" / "metrics.csv").read_bytes()
-    losses.clear()
-    for _ in range(2):
-        assert fit(tiny(tiny_data, tmp_path, *STEPS, "evaluation.quantities=true")) == value
-        assert not losses  # nothing is trained again
-        assert {p.name for p in (tmp_path / "fit").glob("quantities_*.csv")} == {"quantities_test.csv", "quantities_test_unseen.csv"}
-    assert (tmp_path / "fit" / "metrics.csv").read_bytes() == metrics
-
-
-@pytest.mark.slow
 def test_a_folder_in_which_nothing_was_saved_is_free(tiny_data: Path, tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="a start at frame 11 needs"):
         fit(tiny(tiny_data, tmp_path, "graph.history=11"))

@@ -118,7 +118,7 @@ def test_hydra_makes_no_folder_outside_the_results(
 
 
 def test_a_name_on_the_command_line_is_a_config_error() -> None:
-    from gpe_pl.config.entry_point import _check_top_level
+    from gpe_pl.config.entry_point import _check_name
 
     with pytest.raises(ConfigError, match=r"^name='a:b': holds :"):
-        _check_top_level(compose("evaluate", ["checkpoint=sand", "name='a:b'"]), "evaluate")
+        _check_name(compose("evaluate", ["checkpoint=sand", "name='a:b'"]), "evaluate")

@@ -15,8 +15,9 @@ import pytest
 from gpe_pl.data.importers import ImportFailure, assemble, save_dataset
 from gpe_pl.data.validate import validate
 from gpe_pl.geometry.periodicity import Periodicity, PeriodicityError
-from gpe_pl.geometry.shapes import Box, domain_walls
+from gpe_pl.geometry.shapes import Box, Shape, domain_walls
 from gpe_pl.schema import STICKY, node_code
+from gpe_pl.trajectory import trajectory as trajectory_module
 from gpe_pl.trajectory.arrays import ArrayError, estimated_normals, typical_spacing
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.store import iter_trajectories, read_trajectory
@@ -210,19 +211,21 @@ def test_a_boundary_of_points() -> None:
     assert (Boundary.from_numpy([[0.0, 0.0]], [[0, 1]]).friction == STICKY).all()
 
 
-def test_shapes_are_those_of_all_boundary_points() -> None:
-    """Otherwise the elastic law and containment see no wall where there are points only."""
+def test_boundary_points_without_a_shape_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    """The elastic law and containment see no wall there."""
+    trajectory_module._warn_of_missing_shapes.cache_clear()
     walls, box = domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.3), Box((0.4, 0.2), (0.6, 0.4), 0.3)
     sampled = Boundary.sample((*walls, box), 0.05, 2)
-    for shapes in ((*walls, box), ()):
+    every: tuple[tuple[Shape, ...], ...] = ((*walls, box), ())
+    for shapes in every:
         given = Boundary.from_numpy(sampled.pos, sampled.normal, shapes=shapes)
         assert trajectory(boundary=given).boundary.shapes == shapes
+    assert not caplog.messages
     part = Boundary.from_numpy(sampled.pos, sampled.normal, shapes=walls)
-    with pytest.raises(
-        ArrayError,
-        match=r"boundary shapes: boundary_node \d+ is 0.4 m from the surface of every shape; give the shapes of all walls, or none",
-    ):
+    for _ in range(2):
         trajectory(boundary=part)
+    (said,) = caplog.messages
+    assert said.startswith("boundary: some nodes are on none of the shapes; containment, pictures and the elastic law see shapes only")
 
 
 def test_boundary_points_given_as_integers_are_positions() -> None:

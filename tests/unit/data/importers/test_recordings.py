@@ -29,7 +29,7 @@ def warnings(folder: Path, settings: dict[str, Any] | None = None, **splits: lis
     for split, scenes in splits.items():
         (folder / "raw" / split).mkdir(parents=True)
         for k, pos in enumerate(scenes):
-            arrays = {"pos": pos, "frame_dt": DT, "materials": "solid", "params_solid": 1e6, "gravity": [0.0, -9.81]}
+            arrays: dict[str, Any] = {"pos": pos, "frame_dt": DT, "materials": "solid", "params_solid": 1e6, "gravity": [0.0, -9.81]}
             np.savez(folder / "raw" / split / f"{split}{k}.npz", **arrays)
     report, _ = imported(folder / "sets", folder / "raw", "arrays", **(settings or {}))
     return [w for w in report.warnings if "recording" in w]
