@@ -30,7 +30,7 @@ class Part:
     """What is known of one trajectory.
 
     Attributes:
-        digests: digest of the positions of each frame; it does not depend on the order of the nodes.
+        digests: digest of the positions of each frame, in the precision of the store; it does not depend on the order of the nodes.
         moves: whether each frame differs from the one before.
         num_nodes: number of nodes.
         first: positions of the followed nodes in the first frame [m].
@@ -66,9 +66,9 @@ class Recordings:
     def __init__(self) -> None:
         self.parts: dict[int, Part] = {}
 
-    def add(self, item: Item, trajectory: Trajectory) -> None:
-        """Add a trajectory."""
-        self.parts[id(item)] = Part.of(trajectory)
+    def add(self, item: Item, part: Part) -> None:
+        """Add what is known of a trajectory."""
+        self.parts[id(item)] = part
 
     def across(self, splits: Mapping[str, Sequence[Item]]) -> Iterator[str]:
         """Yield a warning for every split with parts of recordings of a split before it."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -10,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gpe_pl.data.free_flight import FreeFlight, vector
-from gpe_pl.data.importers.recordings import Recordings
+from gpe_pl.data.importers.recordings import Part, Recordings
 from gpe_pl.data.importers.report import Event
 from gpe_pl.data.importers.sampled import free_flight_of
 from gpe_pl.data.importers.source import Facts, Item, Loaded, Refusal
@@ -57,7 +56,7 @@ class Survey:
         lengths: split, name and number of frames of each trajectory.
         spacings, radii: spacing and connectivity radius of each sampled trajectory [m].
         velocity_ratios: mean displacement over mean velocity × frame interval, of each sampled trajectory.
-        scenes: names of trajectories by the digest of their positions.
+        scenes: names of trajectories by the digests of their frames.
         recordings: what tells if trajectories are parts of one recording.
         motions: split, name and motion of each trajectory.
         assumes_gravity: for each trajectory, whether its gravity is only assumed to be the usual one of the format.
@@ -113,14 +112,15 @@ class Survey:
             raise Refusal(
                 f"rigid_body: distances in a body change by {deformation:.3g} of its size, so it is not rigid{wide}; leave rigid_body out"
             )
-        digest = _digest(trajectory.pos)
+        part = Part.of(trajectory)
+        digest = part.digests.tobytes()
         if self.scenes.setdefault(digest, where) != where:
             raise Refusal(f"has exactly the positions of {self.scenes[digest]}: the same scene twice")
         if deformation > NOT_RIGID:
             what = f"distances in a rigid body change by {deformation:.3g} of its size; models keep them"
             self.suspects.append(Event(split, name, -1, what))
         self.good.setdefault(split, []).append(item)
-        self.recordings.add(item, trajectory)
+        self.recordings.add(item, part)
         self.suspects += [Event(split, name, -1, warning) for warning in loaded.warnings]
         self.motions.append((split, name, motion_of(m, trajectory.pos)))
         self.assumes_gravity.append(loaded.assumes_gravity)
@@ -192,13 +192,6 @@ class Flight:
     name: str
     assumed: bool
     free: FreeFlight
-
-
-def _digest(pos: np.ndarray) -> bytes:
-    """Return a digest of positions [frame, node, dim], in the precision of the store, that does not depend on the order of the nodes."""
-    pos = pos.astype(np.float32)
-    order = np.lexsort(pos[[0, -1]].transpose(0, 2, 1).reshape(-1, pos.shape[1]))
-    return hashlib.sha256(np.ascontiguousarray(pos[:, order]).tobytes()).digest()
 
 
 def _velocity_ratio(trajectory: Trajectory) -> float | None:
