@@ -8,7 +8,9 @@ Then interrupted trials continue. Any launcher can run the trials.
 from __future__ import annotations
 
 import json
+import logging
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +26,8 @@ from omegaconf import DictConfig
 
 from gpe_pl.config.launcher import SweepError, UsageError
 from gpe_pl.files.atomic import replace_text
+
+log = logging.getLogger(__name__)
 
 JOURNAL = "optuna.log"
 BEST = "best.json"
@@ -66,6 +70,7 @@ class OptunaSweeper(Sweeper):
         fixed, space = self._split(arguments)
         folder = Path(str(self.config.hydra.sweep.dir))
         folder.mkdir(parents=True, exist_ok=True)
+        _without_unfinished_line(folder / JOURNAL)
         try:
             storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
             study = optuna.create_study(storage=storage, study_name="sweep", load_if_exists=True)
@@ -129,6 +134,17 @@ class OptunaSweeper(Sweeper):
 
 def _overrides(fixed: list[str], trial: Any) -> list[str]:
     return [*fixed, *(f"{key}={_text(value)}" for key, value in trial.params.items())]
+
+
+def _without_unfinished_line(journal: Path) -> None:
+    """Cut off what follows the last line end of a journal: a full disk or a power cut leaves half a line, to which Optuna would append the next one."""
+    if not journal.is_file():
+        return
+    text = journal.read_bytes()
+    whole = text.rfind(b"\n") + 1
+    if whole < len(text):
+        log.warning("%s: its last line was not finished and is dropped", journal)
+        os.truncate(journal, whole)
 
 
 def _distribution(override: Override) -> Any:

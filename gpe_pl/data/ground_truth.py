@@ -41,9 +41,6 @@ class GenerationError(GpeError):
         super().__init__(message)
         self.split, self.index, self.seed = split, index, seed
 
-    def __reduce__(self) -> tuple[Any, ...]:  # crosses process boundaries
-        return type(self), (str(self), self.split, self.index, self.seed)
-
 
 @runtime_checkable
 class Solver(Simulator, Protocol):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from gpe_pl.errors.printable import one_line
 
 
@@ -13,3 +15,11 @@ class GpeError(Exception):
 
     def __str__(self) -> str:
         return one_line(super().__str__())
+
+    def __reduce__(self) -> tuple[Any, ...]:  # errors cross process boundaries, also those with an ``__init__`` of their own
+        return _rebuilt, (type(self), self.args), self.__dict__
+
+
+def _rebuilt(kind: type[GpeError], args: tuple[Any, ...]) -> GpeError:
+    """Return an error of a class without a call of its ``__init__``."""
+    return kind.__new__(kind, *args)

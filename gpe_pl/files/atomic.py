@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import errno
 import glob
+import hashlib
 import os
 import platform
+import secrets
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -22,6 +24,10 @@ ALMOST_FULL = 2**20
 """A disk with fewer free bytes counts as full. A command that fails has often removed its unfinished file already, which frees some bytes."""
 
 
+LONGEST_STEM = 204
+"""Longest name of a file, without its suffix, that names of temporary files contain [bytes]."""
+
+
 class FullDiskError(GpeError):
     """Raised when the disk is full; the message names the file or folder that was written."""
 
@@ -29,25 +35,23 @@ class FullDiskError(GpeError):
         super().__init__(f"{path}: cannot be written, there is no room ({reason}); make some, and run the command again")
         self.path, self.reason = path, reason
 
-    def __reduce__(self) -> tuple[type[FullDiskError], tuple[Path, str]]:  # crosses process boundaries
-        return type(self), (self.path, self.reason)
-
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path in the folder of ``path``, with the same suffix, that replaces ``path`` when the block succeeds.
 
-    The temporary file or folder is removed when the block fails. A missing folder is created. Leftovers of killed processes are removed.
+    The temporary file or folder is removed when the block fails. A missing folder is created. Leftovers of killed processes of this machine are removed.
+    Its name has a part drawn at random, because other containers can have the host name and the process ids of this one.
 
     Raises:
         FullDiskError: there is no room.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    start, end = f".{path.stem}.{platform.node()}.", f".part{path.suffix}"
+    start, end = f".{_shortened(path.stem)}.{machine_name()}.", f".part{path.suffix}"
     for leftover in path.parent.glob(f"{glob.escape(start)}*{glob.escape(end)}"):
-        if not _is_running(leftover.name.removeprefix(start).removesuffix(end)):
+        if not _is_running(leftover.name.removeprefix(start).removesuffix(end).partition("-")[0]):
             _remove(leftover)
-    part = path.with_name(f"{start}{os.getpid()}{end}")
+    part = path.with_name(f"{start}{os.getpid()}-{secrets.token_hex(4)}{end}")
     try:
         yield part
         _flush(part)
@@ -89,6 +93,20 @@ def replace_bytes(path: Path, content: bytes | bytearray | memoryview) -> None:
     """Write a binary file atomically."""
     with replacing(path) as part:
         part.write_bytes(content)
+
+
+def machine_name() -> str:
+    """Return a short name of the machine and, on Linux, of the container, whose process ids mean nothing outside it."""
+    try:
+        container = os.readlink("/proc/self/ns/pid")
+    except OSError:
+        container = ""
+    return hashlib.sha256(f"{platform.node()} {container}".encode()).hexdigest()[:8]
+
+
+def _shortened(stem: str) -> str:
+    """Return a name to which some forty bytes can be added; file systems allow 255."""
+    return stem if len(stem.encode()) <= LONGEST_STEM else hashlib.sha256(stem.encode()).hexdigest()
 
 
 def _is_running(pid: str) -> bool:

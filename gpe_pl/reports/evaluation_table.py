@@ -83,14 +83,13 @@ def _error_lines(groups: Labelled) -> list[str]:
     lines = [table_row(header), "|" + "---|" * len(header)]
     for (domain, split), own in groups.items():
         errors = {label: rollout_errors([run], split, "full") for label, run in own.items()}
-        first = next(iter(errors.values()))
+        first = next((found for found in errors.values() if found), [])
         for label, run in own.items():
             raw = [value for seed in values_by_seed([run], LEARNED, split, "rollout_mse", "full") for value in seed.values()]
             moved = values_by_seed([run], LEARNED, split, "fraction_corrected", "full")
-            mean = bootstrap_interval(1e3 * shared_table(errors[label]), statistic=median_of_means)
             cells = [
                 *(domain, split, label, str(len(raw))),
-                f"{mean.estimate:.3g} [{mean.low:.3g}, {mean.high:.3g}]",
+                _mean(errors[label]),
                 _over(errors[label], first),
                 str(sum(value == float("inf") for value in raw)),
                 f"{100 * float(shared_table(moved).mean()):.2g} %" if moved else "–",
@@ -104,10 +103,18 @@ def _error_lines(groups: Labelled) -> list[str]:
     return [*lines, "", note, *(["", f"**{DIFFERENT_STARTS.format(', '.join(starts))}**"] if starts else [])]
 
 
+def _mean(errors: Values) -> str:
+    """Return the mean error [1e-3 m²] with its interval, or a dash for an evaluation without rollouts."""
+    if not errors:
+        return "–"
+    mean = bootstrap_interval(1e3 * shared_table(errors), statistic=median_of_means)
+    return f"{mean.estimate:.3g} [{mean.low:.3g}, {mean.high:.3g}]"
+
+
 def _over(errors: Values, first: Values) -> str:
     """Return the ratio of two models' errors in the scenes of both, with its interval; empty for the first model itself."""
     scenes = shared_trajectories(errors, first)
-    if errors is first or not scenes:
+    if errors is first or not errors or not scenes:
         return ""
     ratio = bootstrap_ratio(shared_table(errors, scenes), shared_table(first, scenes), statistic=median_of_means, is_paired=True)
     return f"{ratio.estimate:.3g} [{ratio.low:.3g}, {ratio.high:.3g}]"

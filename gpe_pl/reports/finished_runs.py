@@ -50,7 +50,10 @@ class Run:
     cost: float | None = None
 
 
-WITHOUT_CONSEQUENCE = {"evaluation.num_pictures", "evaluation.export", "evaluation.material_controls"}
+WITHOUT_CONSEQUENCE = {
+    *("evaluation.num_pictures", "evaluation.export", "evaluation.material_controls"),
+    *("training.compile", "training.cuda_graph"),  # the same computation, up to rounding
+}
 """Keys ignored when comparing runs."""
 
 TRAINED = {"data.name": str, "model._target_": str, "training.num_steps": int}

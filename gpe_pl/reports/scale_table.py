@@ -85,8 +85,9 @@ def _numbers(listed: str) -> list[float]:
 
 
 def _shared_instants(runs: list[Run]) -> list[str]:
+    """Return the horizons that all runs have, without the full length, whose number of frames differs; but with it if there is no other."""
     found = [{*run.rows[run.rows["metric"] == "rollout_mse"]["horizon"]} for run in runs]
-    return sorted(set.intersection(*found) - {FULL}, key=time_of)
+    return sorted(set.intersection(*found) - {FULL}, key=time_of) or [FULL]
 
 
 def _ratio(runs: list[Run], reference: list[Run], instant: str) -> str:

@@ -45,7 +45,7 @@ def stride_lines(axes: list[str], variants: dict[tuple[str, ...], list[Run]]) ->
     names = [axis.rpartition(".")[2] for axis in compress(axes, shown)]
     header = [*names, "split", *(f"at {instant}" for instant in instants), "failed", "cost [s/s]", "edges per node"]
     lines = [table_row(header), "|" + "---|" * len(header)]
-    for split in splits_of(first[0]):
+    for split in sorted({split for runs in variants.values() for run in runs for split in splits_of(run)}):
         for key, runs in variants.items():
             errors = [_error(runs, first if len(starts) < 2 else runs, split, instant, variants) for instant in instants]
             ends = [value for seed in values_by_seed(runs, LEARNED, split, ERROR, FULL) for value in seed.values()]

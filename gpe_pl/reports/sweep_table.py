@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import logging
 from collections import defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from gpe_pl.reports.outcome import outcomes
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
 from gpe_pl.reports.stride_table import DIFFERENT_STARTS, STRIDES_MD, stride_lines
 from gpe_pl.rollout.baselines import BASELINES
+from gpe_pl.viz.coloring import MOST_CURVES
 from gpe_pl.viz.saving import save_figure
 
 log = logging.getLogger(__name__)
@@ -110,6 +112,8 @@ def _report(folder: Path, runs: list[Run]) -> None:
     - ``validation_loss.png``, if every variant has a validation curve.
     - ``reads_material.png``, if a variant has controls of the material.
     - ``error_by_parameter.png``, if the first run was evaluated on unseen material parameters.
+
+    Curves of more than ``MOST_CURVES`` variants are not drawn.
     """
     if not runs:
         return
@@ -121,13 +125,16 @@ def _report(folder: Path, runs: list[Run]) -> None:
         replace_text(folder / STRIDES_MD, "\n".join([*strides, ""]))
     curves = {", ".join(v) or LEARNED: [validation_curve(r) for r in members] for v, members in variants.items()}
     curves = {k: [c for c in v if len(c[0])] for k, v in curves.items()}
-    if all(curves.values()):
+    can_be_drawn = len(variants) <= MOST_CURVES
+    if not can_be_drawn:
+        log.warning("%s: %d variants, but no more than %d can be told apart in one figure; tables only", folder, len(variants), MOST_CURVES)
+    if can_be_drawn and all(curves.values()):
         from gpe_pl.viz.figures import validation_loss_figure
 
         save_figure(validation_loss_figure(curves), folder / "validation_loss.png", dpi=150)
     write_material_figure(folder / MATERIALS_FIGURE, _material_groups(variants))
     rows = runs[0].rows
-    if (rows["parameter_group"].isin(UNSEEN_GROUPS) & np.isfinite(rows["parameter"])).any():
+    if can_be_drawn and (rows["parameter_group"].isin(UNSEEN_GROUPS) & np.isfinite(rows["parameter"])).any():
         by_label = {", ".join(v) or LEARNED: members for v, members in variants.items()}
         save_figure(parameter_curves({str(runs[0].config["data.name"]): by_label}), folder / PARAMETER_FIGURE, dpi=150)
 
@@ -218,12 +225,11 @@ def forward_time_ratios(folder: Path, variants: dict[Variant, list[Run]]) -> dic
 
 def _markdown(axes: list[str], variants: dict[Variant, list[Run]], ratios: dict[Variant, float]) -> str:
     names = [_column(a) for a in axes] or ["model"]
-    first = next(iter(variants.values()))[0]
     return "\n".join(
         [
             *_training_table(names, variants, ratios),
             "",
-            *_rollout_table(names, variants, first),
+            *_rollout_table(names, variants),
             *_different_starts(variants),
             *_stress_table(names, variants),
             *_metric_table(names, variants, BODY_COLUMNS, BODY_NOTE),
@@ -270,16 +276,17 @@ def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios
     return [*lines, *rows, "", note]
 
 
-def _rollout_table(names: list[str], variants: dict[Variant, list[Run]], first: Run) -> list[str]:
-    splits = splits_of(first)
-    horizons = _horizons(first)
-    baselines = sorted({*first.rows["model"]} & {*BASELINES})
+def _rollout_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[str]:
+    runs_of_all = [run for runs in variants.values() for run in runs]
+    splits = sorted({split for run in runs_of_all for split in splits_of(run)})
+    horizons = _horizons(runs_of_all)
+    baselines = sorted({model for run in runs_of_all for model in run.rows["model"]} & {*BASELINES})
     header = [*names, "split", *(f"@{h}" for h in horizons)]
     lines = [table_row(header), "|" + "---|" * len(header)]
     for split in splits:
         for key, runs in variants.items():
             trivial = {
-                h: min((_mean(values_by_seed(runs[:1], b, split, "rollout_mse", h)) for b in baselines), default=float("nan"))
+                h: min((_mean(v) for b in baselines if (v := values_by_seed(runs[:1], b, split, "rollout_mse", h))), default=float("nan"))
                 for h in horizons
             }
             cells = []
@@ -289,8 +296,13 @@ def _rollout_table(names: list[str], variants: dict[Variant, list[Run]], first: 
                 cells.append(_interval(values, 1e3) + _factor(trivial[h] / _mean(values)) + failed if values else "–")
             lines.append(table_row([*(key or (LEARNED,)), split, *cells]))
         for baseline in baselines:
-            cells = [_interval(values_by_seed([first], baseline, split, "rollout_mse", h), 1e3) for h in horizons]
-            lines.append(table_row([baseline, *[""] * (len(names) - 1), split, *cells]))
+            rows: defaultdict[tuple[str, ...], list[Variant]] = defaultdict(list)  # most sweeps evaluate all variants in the same scenes
+            for key, runs in variants.items():
+                rows[tuple(_interval(values_by_seed(runs[:1], baseline, split, "rollout_mse", h), 1e3) for h in horizons)].append(key)
+            rows.pop(("–",) * len(horizons), None)
+            for shown, keys in rows.items():
+                of = f"{baseline} ({' / '.join(', '.join(key) for key in keys)})" if len(rows) > 1 else baseline
+                lines.append(table_row([of, *[""] * (len(names) - 1), split, *shown]))
     note = (
         "Rollout MSE ×1e-3 [m²] over frames 1 … h, nodes and axes: mean over trajectories and seeds, 95 % bootstrap interval over both (too narrow where "
         "seeds or trajectories are few), and how many times lower than the best trivial baseline (bold where it is lower). A rollout that had to be "
@@ -310,8 +322,8 @@ def _different_starts(variants: dict[Variant, list[Run]]) -> list[str]:
     return ["", f"**{DIFFERENT_STARTS.format(', '.join(starts))}**"] if starts else []
 
 
-def _horizons(run: Run) -> list[str]:
-    found = {*run.rows[run.rows["metric"] == "rollout_mse"]["horizon"]}
+def _horizons(runs: Iterable[Run]) -> list[str]:
+    found = {horizon for run in runs for horizon in run.rows[run.rows["metric"] == "rollout_mse"]["horizon"]}
     return sorted(found, key=time_of)[-TABLE_HORIZONS:]
 
 
@@ -320,11 +332,11 @@ def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[
     stressed = {key: runs for key, runs in variants.items() if runs[0].rows["metric"].isin(STRESS_METRICS).any()}
     if not stressed:
         return []
-    horizons = _horizons(next(iter(stressed.values()))[0])
+    horizons = _horizons(run for runs in stressed.values() for run in runs)
     header = [*names, "split", "relative error", *(f"@{h}" for h in horizons)]
     lines = ["", table_row(header), "|" + "---|" * len(header)]
     for key, runs in stressed.items():
-        for split in sorted({*runs[0].rows["split"]}):
+        for split in sorted({split for run in runs for split in run.rows["split"]}):
             for metric in ("displacement_error", "velocity_error", *STRESS_METRICS):
                 cells = [_interval(values_by_seed(runs, LEARNED, split, metric, h)) for h in horizons]
                 lines.append(table_row([*(key or (LEARNED,)), split, metric.removesuffix("_error").replace("_", " "), *cells]))

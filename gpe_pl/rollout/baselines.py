@@ -17,7 +17,7 @@ NUM_BISECTIONS = 30
 
 @dataclass(frozen=True)
 class ConstantVelocity:
-    """Every node keeps its velocity and ignores walls.
+    """Every node keeps its velocity, and every rigid body its momentum and angular momentum; walls are ignored.
 
     Attributes:
         dt: frame interval [s].
@@ -26,7 +26,7 @@ class ConstantVelocity:
     dt: float
 
     def step(self, state: State) -> State:
-        return state.later(self.dt, state.pos + state.vel * self.dt, state.vel)
+        return moved_rigidly(state, state.later(self.dt, state.pos + state.vel * self.dt, state.vel), self.dt)
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,10 @@ from gpe_pl.geometry.compiled_surfaces import FACING, NUM_PASSES, put_back
 from gpe_pl.geometry.shapes import Shape, outward_normal, signed_distance, surface_tolerance
 from gpe_pl.rollout.ensemble import Ensemble
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
+from gpe_pl.rollout.rigid_containment import put_back_body
 from gpe_pl.system.compiled import is_wanted
 from gpe_pl.trajectory.boundary import Array, as_numpy
-from gpe_pl.trajectory.rigid_bodies import bodies_of
+from gpe_pl.trajectory.rigid_bodies import bodies_of, whole_body
 from gpe_pl.trajectory.state import State
 
 log = logging.getLogger(__name__)
@@ -27,8 +28,8 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
 
     In a narrow gap between surfaces, a node may still be inside afterwards; it then returns to its position before the step. So does a node between two
     surfaces that face each other, such as the floor and the lower face of a box that stands on it. Velocities and the last entry of
-    the velocity history change by displacement / ``dt``, so that they remain differences of positions. A rigid body moves as a whole, by the displacements of
-    its deepest nodes.
+    the velocity history change by displacement / ``dt``, so that they remain differences of positions. A rigid body moves as a whole
+    (``rollout.rigid_containment``).
 
     Args:
         state: state after a step.
@@ -92,24 +93,21 @@ def _contain_plainly(state: State, dt: float, tolerance: float) -> tuple[State, 
 
 
 def _contain_bodies(state: State, contained: State, inside: Array, dt: float) -> tuple[State, Array]:
-    """Return the results of ``contain``, given those of ``_contain_nodes``. A body moves by the displacement of its deepest node until no node is inside."""
+    """Return the results of ``contain``, given those of ``_contain_nodes``."""
     shapes, xp = state.boundary.shapes, array_namespace(state.pos)
-    tolerance = surface_tolerance(shapes)
     pos, vel, moves = contained.pos + 0.0, contained.vel + 0.0, inside | False
     for rows in bodies_of(state.rigid_body):
         if not bool(xp.any(inside[rows])):
             continue
-        start = _plain(state.pos[rows])
-        own = start
-        for _ in range(NUM_PASSES):
-            if not bool((signed_distance(shapes, own) < -tolerance).any()):
-                break
-            push = _on_surfaces(shapes, own, tolerance) - own
-            own = own + push[(push**2).sum(-1).argmax()]
-        if bool((signed_distance(shapes, own) < -tolerance).any()):
+        start, mass = _plain(whole_body(state, rows)), state.mass[rows]
+        mass = np.asarray(mass) if isinstance(start, np.ndarray) else mass
+        own = put_back_body(shapes, start, mass, state.periodicity.wrapped, surface_tolerance(shapes))
+        if own is None:
             own = start - _plain(state.vel[rows]) * dt
-        pos[rows], moves[rows] = state.periodicity.wrapped(xp.asarray(own)), True
-        vel[rows] = state.vel[rows] + xp.asarray(own - start) / dt
+        way = own - start
+        own, way = (xp.asarray(own), xp.asarray(way)) if isinstance(start, np.ndarray) else (own, way)
+        pos[rows], moves[rows] = state.periodicity.wrapped(own), True
+        vel[rows] = state.vel[rows] + way / dt
     return state.corrected(pos, vel), moves
 
 

@@ -15,7 +15,7 @@ import logging
 import os
 import platform
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -103,23 +103,48 @@ def locked(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bo
 
 
 def _acquired(folder: Path, path: Path, waits: bool) -> BaseFileLock:
+    def take(lock: BaseFileLock) -> None:
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            if not waits:
+                advice = f"; if that process is gone, delete {path}" if isinstance(lock, SoftFileLock) else ""
+                raise FolderError(f"{folder}: another command writes to it ({_holder(folder)}); wait until it has ended{advice}") from None
+            log.warning("%s: waiting until another command has written it (%s)", folder, _holder(folder))
+            lock.acquire(poll_interval=0.2)
+
+    return _taken(path, take)
+
+
+@contextlib.contextmanager
+def alone(path: Path) -> Iterator[None]:
+    """Wait until no other process is in a block with this lock file.
+
+    Raises:
+        FolderError: the lock file cannot be written.
+    """
+    lock = _taken(path, lambda lock: lock.acquire(poll_interval=0.2))
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _taken(path: Path, take: Callable[[BaseFileLock], object]) -> BaseFileLock:
+    """Return a lock that ``take`` has acquired: a lock of the disk, or a lock file where the disk has no locks."""
     for kind in (FileLock, SoftFileLock):
         lock: BaseFileLock = kind(path, thread_local=False)
+        was_there = path.exists()
         try:
-            try:
-                lock.acquire(timeout=0)
-            except Timeout:
-                if not waits:
-                    advice = f"; if that process is gone, delete {path}" if isinstance(lock, SoftFileLock) else ""
-                    raise FolderError(
-                        f"{folder}: another command writes to it ({_holder(folder)}); wait until it has ended{advice}"
-                    ) from None
-                log.warning("%s: waiting until another command has written it (%s)", folder, _holder(folder))
-                lock.acquire(poll_interval=0.2)
+            take(lock)
             return lock
         except OSError as error:
             if isinstance(error, Timeout) or error.errno not in WITHOUT_LOCKS:
                 raise FolderError(f"{path}: cannot be locked ({error.strerror or error}); choose a folder that can be written") from None
+            if not was_there and path.exists() and not path.stat().st_size:
+                path.unlink(
+                    missing_ok=True
+                )  # the first kind made it before it found that there are no locks; the second would wait for its owner
     raise FolderError(f"{path}: the disk has no locks; choose a folder on another disk")
 
 

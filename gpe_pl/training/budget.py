@@ -19,7 +19,6 @@ from typing import Annotated, Any
 
 import lightning as L
 import torch
-from filelock import FileLock
 from pydantic import Field, TypeAdapter, ValidationError
 
 from gpe_pl.data.augmentation import Augmentation
@@ -27,6 +26,7 @@ from gpe_pl.data.dataset import WindowDataset, collated
 from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
 from gpe_pl.files import sealed
+from gpe_pl.system.locks import alone
 from gpe_pl.system.machine import gemm_rate
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
 from gpe_pl.training.optimizer import OnePassAdam, clip
@@ -162,7 +162,7 @@ def within_budget(
     """
     assert settings.budget_minutes is not None
     path.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(_lock(path)):
+    with alone(_lock(path)):
         times = read_times(path)
         if key not in times:
             with _announced(path):
@@ -209,7 +209,7 @@ class PauseForMeasurements(L.Callback):
 
     def on_train_batch_start(self, *_: Any) -> None:
         if _announcement(self.path).exists():
-            with FileLock(_lock(self.path)):  # free once the measurement, or its process, has ended
+            with alone(_lock(self.path)):  # free once the measurement, or its process, has ended
                 _announcement(self.path).unlink(missing_ok=True)
 
 

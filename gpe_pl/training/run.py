@@ -193,7 +193,11 @@ def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
     for path in sorted(folder.rglob(CONFIG)):
         trained = path.parent / "checkpoints" / "best.ckpt"
         if (path.parent / "metrics.csv").exists() and trained.exists():
-            there = config_in(path)
+            try:
+                there = config_in(path)
+            except RunError as error:
+                log.warning("%s; looking for a trained model in the other runs", error)
+                continue
             if not differences({key: value for key, value in there.items() if key != "evaluation"}, config):
                 own = run_dir / "checkpoints" / "best.ckpt"
                 if rank_zero_only.rank == 0:  # type: ignore[attr-defined]

@@ -68,16 +68,46 @@ def moved_rigidly(before: State, after: State, dt: float) -> State:
         return after
     pos, vel = after.pos + 0.0, after.vel + 0.0  # copies that keep gradients
     for rows in bodies_of(before.rigid_body):
-        way = rigid_displacement(_whole(before, rows), after.vel[rows], before.mass[rows], dt)
+        way = rigid_displacement(whole_body(before, rows), after.vel[rows], before.mass[rows], dt)
         pos[rows] = before.periodicity.wrapped(before.pos[rows] + way)
         vel[rows] = way / dt
     return after.corrected(pos, vel)
 
 
-def _whole(state: State, rows: Array) -> Array:
+def whole_body(state: State, rows: Array) -> Array:
     """Return the positions of a body [body_node, dim] in m, undivided by the seam of a periodic domain."""
     pos = state.pos[rows]
     return pos if not state.periodicity else pos[:1] + state.periodicity.shortest(pos - pos[:1])
+
+
+def rigid_modes(pos: Array, mass: Array) -> Array:
+    """Return small rigid motions [mode, node, dim] of one body: translations along the axes, then rotations about the centre of mass.
+
+    They are orthonormal with respect to the masses: Σ w u · v is 1 for a mode with itself and 0 for two modes, with w = m / Σ m. A rotation that moves no
+    node is 0.
+
+    Args:
+        pos: positions [node, dim] in m.
+        mass: masses [node] in kg.
+    """
+    xp = array_namespace(pos)
+    dim = pos.shape[1]
+    weight = xp.astype(mass, pos.dtype)[:, None]
+    weight = weight / xp.sum(weight)
+    arm = pos - xp.sum(weight * pos, axis=0)
+    axes = xp.eye(dim, dtype=arm.dtype, device=device(arm))
+    shifts = axes[:, None, :] + 0 * arm
+    if dim == 2:
+        turns = xp.stack([-arm[:, 1], arm[:, 0]], axis=1)[None]
+    else:
+        turns = xp.stack([_cross(axes[k] + 0 * arm, arm) for k in range(dim)])
+    trace = xp.sum(weight * arm**2) + TINY
+    inertia = xp.sum(weight * turns[:, None] * turns[None], axis=(2, 3)) + NO_INERTIA * trace * xp.eye(
+        len(turns), dtype=arm.dtype, device=device(arm)
+    )
+    factor = xp.linalg.cholesky(inertia)
+    turns = xp.linalg.solve(factor, xp.reshape(turns, (len(turns), -1)))
+    return xp.concat([shifts, xp.reshape(turns, (-1, *arm.shape))])
 
 
 def rigid_displacement(pos: Array, vel: Array, mass: Array, dt: float) -> Array:

@@ -9,9 +9,11 @@ All functions that read raise ``StoreError`` where something is missing, damaged
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, fields
@@ -39,6 +41,17 @@ from gpe_pl.trajectory.values import faults, size_conflicts
 
 class StoreError(GpeError, ValueError):
     """Raised when a file of the store is missing, damaged or of another schema; the message names file, trajectory and field."""
+
+
+class ReadError(GpeError):
+    """Raised when the machine keeps a file of the store from being read. The file itself can be sound, so nobody should delete it for this."""
+
+
+OF_THE_MACHINE = {
+    *(errno.EACCES, errno.EPERM, errno.EAGAIN, errno.EBUSY, errno.EINTR, errno.EIO, errno.EMFILE, errno.ENFILE),
+    *(errno.ENOLCK, errno.ENOMEM, errno.ESTALE, errno.ETIMEDOUT),
+}
+"""Error numbers that say nothing about the content of a file."""
 
 
 class UnsoundError(StoreError):
@@ -220,12 +233,17 @@ def open_shard(path: Path | str) -> Iterator[h5py.File]:
     """Open a shard of this schema version for reading.
 
     Errors of the types that HDF5 raises on damaged files, such as ``OSError`` and ``ValueError``, become ``StoreError``. This includes errors in the block.
+    The file is not locked: shards are complete when they get their names, and some disks have no locks.
+
+    Raises:
+        StoreError: the file is missing, damaged, or of another schema.
+        ReadError: the machine cannot read it: no permission, no memory, too many open files.
     """
     path = Path(path)
     if not path.is_file():
         raise StoreError(f"{path}: no such file; generate data with `python -m gpe_pl.simulate`")
     try:
-        with h5py.File(path, "r") as file:
+        with h5py.File(path, "r", locking=False) as file:
             version = attribute(file, "schema_version")
             if not isinstance(version, np.integer) or version != SCHEMA_VERSION:
                 raise StoreError(
@@ -235,9 +253,18 @@ def open_shard(path: Path | str) -> Iterator[h5py.File]:
     except StoreError:
         raise
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:  # HDF5 and h5py raise all of these
+        _require_machine(path, error)
         raise StoreError(
             f"{path}: not a readable HDF5 file (damaged or truncated: {error}); delete it and generate or import the data again"
         ) from error
+
+
+def _require_machine(path: Path | str, error: Exception) -> None:
+    """Raise ``ReadError`` if an error comes from the machine, not from the content of a file."""
+    if isinstance(error, MemoryError):
+        raise ReadError(f"{path}: cannot be read, there is no memory left ({error}); close other programs, or use fewer workers") from error
+    if isinstance(error, OSError) and error.errno in OF_THE_MACHINE:
+        raise ReadError(f"{path}: cannot be read ({os.strerror(error.errno)}); the file may be sound, so do not delete it") from error
 
 
 def _where(group: h5py.Group) -> str:
@@ -287,7 +314,8 @@ def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.n
     try:
         has_frames = spec.dims[0] == "frame" or (spec.dims[0] == MOTION and dataset.shape[0] > 1)
         return dataset[frames] if frames is not None and has_frames else dataset[()]
-    except (OSError, RuntimeError):
+    except (OSError, RuntimeError) as error:
+        _require_machine(group.file.filename, error)
         where = f"{_where(group)}: field {key!r}"
         raise StoreError(f"{where} is damaged (checksum mismatch); {ADVICE}") from None
 

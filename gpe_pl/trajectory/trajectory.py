@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 def _warn_of_missing_shapes() -> None:
     """Warn, once in a process, of boundaries whose shapes are not all there."""
     log.warning(
-        "boundary: some nodes are on none of the shapes; containment, pictures and the elastic law see shapes only; give the shapes of all walls, or none"
+        "boundary: some nodes are on none of the shapes; containment and the elastic law see shapes only; give the shapes of all walls, or none"
     )
 
 

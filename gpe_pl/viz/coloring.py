@@ -1,5 +1,6 @@
 """Meaning of the colours of particles and mesh cells."""
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
@@ -18,12 +19,27 @@ from gpe_pl.viz.camera import vertical_axis
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Colours that colour-blind readers can distinguish (Okabe and Ito, Color universal design, 2008)."""
 
+DASHES = ("-", "--", ":", "-.")
+MOST_CURVES = math.lcm(len(PALETTE), len(DASHES))
+"""Number of curves in one figure up to which no two have the same colour and line style."""
+
 MATERIAL_COLORS = {"sand": "#E69F00", "snow": "#56B4E9", "fluid": "#0072B2", "elastomer": "#D55E00", "solid": "#009E73"}
 
 REFERENCE = "#7A8B99"
 """Colour of items without a value: ground-truth particles under ``error``, particles without a stress under ``von_mises``, and moving walls."""
 
 ColorBy = Literal["error", "height", "material", "speed", "von_mises"]
+
+
+def curve_styles(count: int) -> list[tuple[str, str]]:
+    """Return colour and line style of every curve. Neighbours differ in both, so that coinciding curves can be told apart.
+
+    Raises:
+        ValueError: there are more than ``MOST_CURVES``.
+    """
+    if count > MOST_CURVES:
+        raise ValueError(f"{count} curves, but no more than {MOST_CURVES} can be told apart in one figure")
+    return [(PALETTE[k % len(PALETTE)], DASHES[k % len(DASHES)]) for k in range(count)]
 
 
 def _shortened(name: str, low: float, high: float) -> Colormap:

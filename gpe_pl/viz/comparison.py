@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from gpe_pl.metrics import Interval
-from gpe_pl.viz.coloring import PALETTE
+from gpe_pl.viz.coloring import PALETTE, curve_styles
 from gpe_pl.viz.film_strip import TEXT_WIDTH, new_figure
 
 
@@ -73,11 +73,15 @@ def parameter_figure(
         label: label of the vertical axis.
         parameters: labels of the horizontal axes by domain.
         references: models with dashed or dotted grey lines.
+
+    Raises:
+        ValueError: there are more models than can be told apart.
     """
     figure = new_figure(TEXT_WIDTH, 2.4)
     figure.set_layout_engine("constrained")
     panels = figure.subplots(1, len(curves), squeeze=False)[0]
     models = list(dict.fromkeys(m for domain in curves.values() for m in domain))
+    styles = curve_styles(len(models))
     for axes, (domain, by_model) in zip(panels, curves.items(), strict=True):
         values = [p for points in by_model.values() for p in points]
         axes.set_yscale("log")
@@ -86,7 +90,8 @@ def parameter_figure(
         for k, model in enumerate(models):
             points = sorted((p, float(np.median(v))) for p, v in by_model.get(model, {}).items())
             points = [p for p in points if np.isfinite(p[1])]
-            style = ("s--", "d:")[references.index(model) % 2] if model in references else "o-"
+            color, dash = styles[k]
+            style, color = (("s--", "d:")[references.index(model) % 2], "0.45") if model in references else (f"o{dash}", color)
             axes.plot(
                 [p for p, _ in points],
                 [v for _, v in points],
@@ -94,7 +99,7 @@ def parameter_figure(
                 markersize=2.5,
                 linewidth=0.8,
                 zorder=3 - 0.1 * k,  # the first model is not hidden
-                color="0.45" if model in references else PALETTE[k % len(PALETTE)],
+                color=color,
                 label=model,
             )
         axes.plot(

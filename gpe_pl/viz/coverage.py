@@ -62,7 +62,7 @@ def coverage_figure(
             color = colormaps["viridis"](0.9 * k / max(1, len(reached) - 1))
             axes.plot(nominal, 100 * group.inside[:, frame], "o-", markersize=3, linewidth=1, color=color, label=label)
         axes.set_xlim(45, 100)
-        axes.set_ylim(45, 102)
+        axes.set_ylim(_lowest(100 * group.inside[:, list(reached)]), 102)
         axes.legend(fontsize=6, frameon=False, loc="lower right", handlelength=1.2)
         _labelled(axes, f"{name}, {group.num_scenes} scenes", "nominal [%]", "observed [%]")
     over_time, sizes = panels[-2:]
@@ -74,13 +74,18 @@ def coverage_figure(
         over_time.plot(time, 100 * group.inside[row, 1:], color=color, linewidth=1.2, label=name)
         sizes.plot(time, group.radius[1:], color=color, linewidth=1.2, label=f"bands, {name}")
         sizes.plot(time, group.error[1:], color=color, linewidth=1, linestyle=":")
-    over_time.set_ylim(45, 102)
+    over_time.set_ylim(min(_lowest(100 * group.inside[row, 1:]) for group in groups.values()), 102)
     over_time.legend(fontsize=6, frameon=False, loc="lower right", handlelength=1.2)
     sizes.set_yscale("log")
     sizes.set_ylim(bottom=1e-3)
     _labelled(over_time, f"bands of {100 * level:g} %", "time [s]", "observed [%]")
     _labelled(sizes, "bands, and median error (dotted)", "time [s]", "spacings")
     return figure
+
+
+def _lowest(observed: np.ndarray) -> float:
+    """Return the lower end of an axis that shows all coverages [%], the worst of all."""
+    return min(45.0, float(observed.min(initial=100.0)) - 2)
 
 
 def _labelled(axes: Axes, title: str, x: str, y: str) -> None:

@@ -4,7 +4,6 @@ Every function returns a ``Figure``. Save it with ``figure.savefig(path, dpi=300
 made in threads and without a display, and are freed like other objects.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -15,7 +14,7 @@ from matplotlib.ticker import EngFormatter
 
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.captions import pictured
-from gpe_pl.viz.coloring import PALETTE, ColorBy, Coloring
+from gpe_pl.viz.coloring import PALETTE, ColorBy, Coloring, curve_styles
 from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip, new_figure
 
 Numbers = Sequence[int | float] | np.ndarray
@@ -102,7 +101,7 @@ def error_curve_figure(
     ends = [band[1, -1] for band in bands.values() if 0 < band[1, -1] < np.inf]
     if ends:  # the first errors may be mere rounding
         axes.set_ylim(bottom=max(axes.get_ylim()[0], 10.0**-FIRST_DECADES * min(ends)))
-    for (name, band), (color, dash) in zip(bands.items(), _styles(len(bands)), strict=True):
+    for (name, band), (color, dash) in zip(bands.items(), curve_styles(len(bands)), strict=True):
         time = frame_dt * np.arange(1, band.shape[1] + 1)
         low, middle, high = np.where(band > 0, np.minimum(band, ceiling), np.nan)
         axes.fill_between(time, low, high, color=color, alpha=0.18, linewidth=0)
@@ -156,14 +155,21 @@ def validation_loss_figure(curves: Mapping[str, Sequence[tuple[Numbers, Numbers]
 
 def _draw_losses(axes: Axes, runs: Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]], ceiling: float) -> None:
     """Draw seeds and medians; ``ceiling`` stands for infinity."""
-    for (name, seeds), (color, dash) in zip(runs.items(), _styles(len(runs)), strict=True):
+    for (name, seeds), (color, dash) in zip(runs.items(), curve_styles(len(runs)), strict=True):
         for steps, values in seeds:
             axes.plot(steps, np.minimum(values, ceiling), color=color, linewidth=0.5, alpha=0.45)
         start, stop = max(s[0] for s, _ in seeds), min(s[-1] for s, _ in seeds)
         common = np.unique(np.concatenate([s for s, _ in seeds]))
         common = common[(common >= start) & (common <= stop)]
-        logs = np.stack([np.interp(common, s, np.log(np.minimum(v, ceiling))) for s, v in seeds])
-        axes.plot(common, np.exp(np.median(logs, axis=0)), color=color, linestyle=dash, linewidth=1.6, label=name)
+        middle = np.exp(np.median([_log_at(common, s, v) for s, v in seeds], axis=0))
+        axes.plot(common, np.minimum(middle, ceiling), color=color, linestyle=dash, linewidth=1.6, label=name)
+
+
+def _log_at(at: np.ndarray, steps: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return interpolated logarithms. They are infinite next to an infinite value, so that a median of few seeds is no mean with a made-up number."""
+    is_finite = np.isfinite(values)
+    logs = np.interp(at, steps, np.log(np.where(is_finite, values, 1.0)))
+    return np.where(np.interp(at, steps, np.where(is_finite, 0.0, 1.0)) > 0, np.inf, logs)
 
 
 def _clean(steps: Numbers, values: Numbers) -> tuple[np.ndarray, np.ndarray]:
@@ -171,15 +177,6 @@ def _clean(steps: Numbers, values: Numbers) -> tuple[np.ndarray, np.ndarray]:
     if x.shape != y.shape or x.ndim != 1 or len(x) == 0 or (np.diff(x) <= 0).any():
         raise ValueError(f"each seed needs increasing steps and as many values, got {x.shape} and {y.shape}")
     return x, np.where(np.isfinite(y), y, np.inf)
-
-
-def _styles(count: int) -> list[tuple[str, str]]:
-    """Return colour and line style of every curve; neighbours differ in both, so that coinciding curves can be told apart."""
-    dashes = ("-", "--", ":", "-.")
-    most = math.lcm(len(PALETTE), len(dashes))  # pairs do not repeat before this number
-    if count > most:
-        raise ValueError(f"{count} curves, but no more than {most} can be told apart in one figure")
-    return [(PALETTE[k % len(PALETTE)], dashes[k % len(dashes)]) for k in range(count)]
 
 
 def _plain_axes(figure: Figure, place: tuple[int, int, int] = (1, 1, 1)) -> Axes:
@@ -219,7 +216,7 @@ def scaling_figure(
         axes.set_xscale("log")
         axes.set_yscale("log")
         for k, (name, values) in enumerate(curves.items()):
-            axes.plot([*values], [*values.values()], "o-", markersize=3, linewidth=1, color=PALETTE[k], label=name)
+            axes.plot([*values], [*values.values()], "o-", markersize=3, linewidth=1, color=PALETTE[k % len(PALETTE)], label=name)
         if curves:
             first = next(iter(curves.values()))
             ends = np.array([min(first), max(first)], dtype=float)

@@ -76,11 +76,15 @@ def _draw_2d(axes: Any, trajectory: Trajectory) -> None:
             ends = np.array([low, high])
             ends[:, axis] = side[axis]
             axes.plot(*ends.T, color="0.6", linewidth=0.6, linestyle=":", zorder=1)
-    pos = trajectory.boundary.pos
-    distances = [np.abs(shape.signed_distance(pos)) for shape in shapes]
-    loose = pos[np.min(distances, axis=0) > 0.1 * trajectory.metadata.spacing] if shapes else pos
-    if len(loose):  # imported data give some boundaries by nodes only
+    if len(loose := loose_nodes(trajectory)):
         axes.scatter(*loose.T, s=1.0, color=INK, linewidths=0, zorder=2)
+
+
+def loose_nodes(trajectory: Trajectory) -> np.ndarray:
+    """Return positions [node, dim] in m of the boundary nodes that are on no shape. Imported data give some boundaries by nodes only."""
+    pos, shapes = trajectory.boundary.pos, trajectory.boundary.shapes
+    distances = [np.abs(shape.signed_distance(pos)) for shape in shapes]
+    return pos[np.min(distances, axis=0) > 0.1 * trajectory.metadata.spacing] if shapes else pos
 
 
 def _patch(shape: Any) -> Patch | None:

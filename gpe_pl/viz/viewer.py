@@ -34,7 +34,7 @@ from gpe_pl.viz.captions import describe, heading, pictured, with_heading
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error
 from gpe_pl.viz.contact_sheet import informative_color
 from gpe_pl.viz.panel import DOT, drawn_faces, outline, polygon_edges
-from gpe_pl.viz.scenery import BACKDROP, surface_points
+from gpe_pl.viz.scenery import BACKDROP, loose_nodes, surface_points
 
 PAGE = Path(__file__).parent / "page"
 
@@ -320,11 +320,10 @@ def _scenery_2d(trajectory: Trajectory) -> tuple[dict[str, Any], Arrays]:
         ends = np.array([wall.low, wall.high], float)
         ends[:, axis] = wall.offset * wall.normal[axis]
         lines += [(*end, 0.0, 0.0, 0.0, 0.0, *INK_RGB) for end in ends]
-    if not shapes:  # imported data give the boundary by nodes only; draw a cross for each
-        arm = 0.25 * trajectory.metadata.spacing
-        for x, y in trajectory.boundary.pos:
-            for dx, dy in ((arm, 0.0), (0.0, arm)):
-                lines += [(x + sign * dx, y + sign * dy, 0.0, 0.0, 0.0, 0.0, *INK_RGB) for sign in (-1, 1)]
+    arm = 0.25 * trajectory.metadata.spacing
+    for x, y in loose_nodes(trajectory):  # a cross for each
+        for dx, dy in ((arm, 0.0), (0.0, arm)):
+            lines += [(x + sign * dx, y + sign * dy, 0.0, 0.0, 0.0, 0.0, *INK_RGB) for sign in (-1, 1)]
     low, high = np.asarray(trajectory.metadata.bounds, float).T
     for axis in trajectory.metadata.periodicity.axes:  # where space repeats
         for side in (low, high):

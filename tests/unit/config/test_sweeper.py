@@ -145,3 +145,14 @@ def test_a_damaged_journal_is_named(tmp_path: Path, damage: str) -> None:
     path.write_text(damage + path.read_text(encoding="utf-8"), encoding="utf-8")
     with pytest.raises(SweepError, match=r"optuna.log: damaged \(.*\); delete the file to begin the search again"):
         sweeper(tmp_path, Launcher(), num_trials=4).sweep([])
+
+
+def test_a_journal_whose_last_line_was_cut_off_keeps_its_trials(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    sweeper(tmp_path, Launcher(), num_trials=3).sweep([])
+    path = tmp_path / "optuna.log"
+    path.write_bytes(path.read_bytes()[:-20])
+    for num_trials in (4, 5):
+        launcher = Launcher()
+        sweeper(tmp_path, launcher, num_trials=num_trials).sweep([])
+        assert len(launcher.jobs) <= 2
+    assert caplog.text.count("optuna.log: its last line was not finished and is dropped") == 1

@@ -2,12 +2,12 @@
 
 import contextlib
 import dataclasses
+import errno
 import hashlib
 import json
 import logging
 import math
 import os
-import platform
 import shutil
 import signal
 import subprocess
@@ -36,13 +36,14 @@ from gpe_pl.data.ground_truth import (
     scene_seed,
 )
 from gpe_pl.data.validate import validate
+from gpe_pl.files.atomic import machine_name
 from gpe_pl.files.run_folder import RunError
 from gpe_pl.schema import SPLITS
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.scenes import BodyScene
 from gpe_pl.system.locks import FolderError
 from gpe_pl.system.progress import progress_bar
-from gpe_pl.trajectory.store import iter_trajectories, read_trajectory
+from gpe_pl.trajectory.store import ReadError, iter_trajectories, read_trajectory
 from tests.runs import compose
 
 DENSITY = {"sand": 1600.0, "snow": 400.0, "elastomer": 1000.0}
@@ -101,12 +102,31 @@ def test_resume_equals_uninterrupted(folder, tmp_path, num_workers):
     (again / "statistics.json").unlink()
     damaged = again / "val" / "shard-00000.h5"
     damaged.write_bytes(damaged.read_bytes()[:100])
-    half = again / "val" / f".shard-00000.{platform.node()}.{2**30}.part.h5"  # of a process that is gone
+    half = again / "val" / f".shard-00000.{machine_name()}.{2**30}-00.part.h5"  # of a process that is gone
     half.write_bytes(b"half")
     kept = (again / "train" / "shard-00000.h5").stat().st_mtime_ns
     generate(tmp_path, SPEC, num_workers)
     assert contents(again) == contents(folder) and not half.exists()
     assert (again / "train" / "shard-00000.h5").stat().st_mtime_ns == kept
+
+
+def test_shards_that_the_machine_cannot_read_now_are_kept(folder, tmp_path, monkeypatch):
+    again = tmp_path / SPEC.name / SPEC.size
+    shutil.copytree(folder, again)
+    before, opened = contents(again), h5py.File
+    with h5py.File(again / "train" / "shard-00000.h5", "r+"):  # as a viewer has it
+        discard_damaged(tmp_path, SPEC)
+    for error in (OSError(errno.EMFILE, "too many"), OSError(errno.EIO, "disk"), MemoryError("1.2 GiB")):
+
+        def fails(*args, error=error, **kwargs):
+            raise error
+
+        monkeypatch.setattr(h5py, "File", fails)
+        for use in (discard_damaged, generate):
+            with pytest.raises(ReadError, match=r"shard-0000\d\.h5: cannot be read"):
+                use(tmp_path, SPEC)
+        monkeypatch.setattr(h5py, "File", opened)
+    assert contents(again) == before
 
 
 def test_damage_in_place_is_found_and_repaired(folder, tmp_path, caplog):

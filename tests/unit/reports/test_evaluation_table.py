@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -136,3 +137,17 @@ def test_training_runs_and_evaluations_are_told_apart(tmp_path: Path) -> None:
     write_rows(folder / "metrics.csv", [Row(LEARNED, "test", 0, "seen", 20.0, "rollout_mse", "full", 1.0)])
     assert [run.folder.name for run in finished_runs(tmp_path)] == ["trained"]
     assert [run.folder.name for run in evaluations_below(tmp_path)] == ["sand"]
+
+
+def test_an_evaluation_without_rollouts_has_a_dash(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_evaluation(tmp_path / name, "sand", 1.0)
+    config = json.loads((tmp_path / "a" / "config.json").read_text())
+    del config["sha256"]
+    sealed.write(tmp_path / "a" / "config.json", {**config, "checkpoint": "short.ckpt (sha256 0123)"})
+    write_rows(tmp_path / "a" / "metrics.csv", [Row(LEARNED, UNSEEN, 0, "interpolated", 20.5, "one_step_nmse", "1", 0.3)])
+    main([str(tmp_path)])
+    text = (tmp_path / "table.md").read_text()
+    lines = [line for line in text.splitlines() if line.startswith("| sand |")]
+    assert sorted(line.split("|")[4].strip() for line in lines) == ["0", "6"]
+    assert any("| – |" in line for line in lines)

@@ -65,3 +65,17 @@ def test_the_last_checkpoint_is_shipped_with_its_own_evaluations(
     text, weights = (tmp_path / "new.md").read_text(), LearnedSimulator.from_checkpoint("snow").state_dict()
     assert "weights after the last step" in text and "have 25 % of the mean error" in text
     assert all(bool((weights[k] == v).all()) for k, v in LearnedSimulator.from_checkpoint(tmp_path / "new.ckpt").state_dict().items())
+
+
+def test_a_card_judges_as_tables_do(ship_model: ModuleType) -> None:
+    """A failed rollout counts as ballistic flight, and the reference is the best trivial baseline."""
+
+    def card(*errors: Row) -> str:
+        simulator, settings = LearnedSimulator.from_checkpoint("fem"), {"training": {"num_steps": 10, "batch_size": 2}}
+        text: str = ship_model.card("fem", "python -m gpe_pl.fit", "abc", simulator, [*errors], settings)
+        return text
+
+    failed = card(*rows("rollout_mse", 1e-4, math.inf, 1e-4, 1e-4), *rows("rollout_mse", *[9e-3] * 4, model="ballistic"))
+    assert "have 26 % of the mean error of ballistic flight. 1 of 4 failed and count as ballistic flight." in failed
+    poor = [*rows("rollout_mse", 4e-3), *rows("rollout_mse", 9e-3, model="ballistic"), *rows("rollout_mse", 5e-3, model="stops_at_walls")]
+    assert "have 80 % of the mean error of nodes that stop at walls: comparisons would call it *not learned*." in card(*poor)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
+from gpe_pl.evaluation.metric_rows import LEARNED, Row, read_rows, write_rows
 from gpe_pl.files import sealed
 from gpe_pl.reports.finished_runs import finished_runs
 from gpe_pl.reports.tables import write_tables
@@ -73,3 +73,15 @@ def test_other_sweeps_have_no_such_table(tmp_path: Path) -> None:
         write_run(tmp_path / str(stride), "one", 1.0, stride, 1e-3)
     write_tables(tmp_path, finished_runs(tmp_path))
     assert not (tmp_path / "scales.md").exists()
+
+
+def test_runs_without_a_common_instant_are_compared_over_their_full_length(tmp_path: Path) -> None:
+    write_run(tmp_path / "one", "one", 1.0, 1, 1e-3)
+    write_run(tmp_path / "told", "dimensionless", 1.0, 1, 1.25e-3)
+    for name in ("one", "told"):
+        rows = read_rows(tmp_path / name / "metrics.csv")
+        write_rows(tmp_path / name / "metrics.csv", [row for row in rows if row.horizon == "full"])
+    write_tables(tmp_path, finished_runs(tmp_path))
+    header, _, line, *_ = (tmp_path / "scales.md").read_text().splitlines()
+    assert "specialist at full [1e-3 m²]" in header
+    assert "1.25 [1.25, 1.25]" in line

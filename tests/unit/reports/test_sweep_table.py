@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -178,3 +179,48 @@ def test_bodies_have_a_table_of_what_was_measured(runs: Path) -> None:
     assert found["test_unseen"] == ["1", "1 of 2 failed, median inf", "0.25"]
     assert found["test_unseen/extrapolated"] == ["1.5", "1 of 1 failed, median inf", "–"]
     assert [row[2:] for row in cells(runs, "odd") if len(row) == 5 and row[1] == "test_unseen"] == [["–", "–", "–"]]
+
+
+def test_many_variants_have_tables_and_no_figure(tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    for k in range(29):
+        monkeypatch.setitem(ERRORS, (f"kind{k}", 0), [1e-3, 2e-3])
+        write_run(tmp_path / str(k), f"kind{k}", 0)
+    sweep_table.report_sweep(tmp_path, finished_runs(tmp_path))
+    assert "29 variants, but no more than 28 can be told apart in one figure; tables only" in caplog.text
+    assert "kind28" in (tmp_path / "table.md").read_text()
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_splits_and_horizons_of_later_variants_are_shown(tmp_path: Path) -> None:
+    for interaction in ("negated", "odd"):
+        write_run(tmp_path / interaction, interaction, 0)
+    rows = [*read_rows(tmp_path / "odd" / "metrics.csv")]
+    more = [replace(row, split="test", parameter_group="") for row in rows] + [replace(row, horizon="0.1s") for row in rows]
+    write_rows(tmp_path / "odd" / "metrics.csv", [*rows, *more])
+    sweep_table.report_sweep(tmp_path, finished_runs(tmp_path))
+    text = (tmp_path / "table.md").read_text()
+    assert "@0.1s" in text
+    assert any(line.startswith("| odd | test |") for line in text.splitlines())
+    assert not any(line.startswith("| negated | test |") and "[" in line for line in text.splitlines())
+
+
+def test_baselines_of_other_scenes_have_rows_of_their_own(tmp_path: Path) -> None:
+    for interaction in ("negated", "odd"):
+        write_run(tmp_path / interaction, interaction, 0)
+    rows = [*read_rows(tmp_path / "odd" / "metrics.csv")]
+    write_rows(tmp_path / "odd" / "metrics.csv", [replace(row, value=100 * row.value) if row.model == "ballistic" else row for row in rows])
+    sweep_table.report_sweep(tmp_path, finished_runs(tmp_path))
+    lines = [line for line in (tmp_path / "table.md").read_text().splitlines() if "| test_unseen |" in line]
+    assert [line.split("|")[1].strip() for line in lines if "ballistic" in line] == ["ballistic (negated)", "ballistic (odd)"]
+    assert sum("constant_velocity" in line for line in lines) == 1
+
+
+def test_runs_with_and_without_compilation_are_one_variant(tmp_path: Path) -> None:
+    for seed, compile in enumerate(("on", "off")):
+        folder = tmp_path / str(seed)
+        write_run(folder, "negated", seed)
+        config = json.loads((folder / "config.json").read_text())
+        del config["sha256"]
+        sealed.write(folder / "config.json", {**config, "training": {"num_steps": 10, "compile": compile}})
+    axes, variants = sweep_table.variants_of(finished_runs(tmp_path))
+    assert (axes, [len(found) for found in variants.values()]) == ([], [2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import importlib
 import json
 import os
@@ -22,7 +23,7 @@ from gpe_pl import save_dataset
 from gpe_pl.config.entry_point import Report
 from gpe_pl.simulate import simulate
 from gpe_pl.system import locks
-from gpe_pl.system.locks import FolderError, locked
+from gpe_pl.system.locks import FolderError, alone, locked
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests.runs import DATA, compose, generate_tiny
 
@@ -303,3 +304,21 @@ def test_a_damaged_note_about_the_holder_is_no_obstacle(tmp_path: Path) -> None:
             (tmp_path / ".a.holder").write_text(text, encoding="utf-8")
             with pytest.raises(FolderError, match=r"another command writes to it \(which has just begun\)"):
                 locked(tmp_path / "a").__enter__()
+
+
+@pytest.mark.parametrize("number", sorted(locks.WITHOUT_LOCKS))
+def test_a_disk_that_makes_the_file_and_then_says_that_it_has_no_locks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def fails(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", fails)
+    with locked(tmp_path / "a"):
+        assert (tmp_path / ".a.lock").exists()
+        monkeypatch.setattr(locks, "_locked", set())
+        with pytest.raises(FolderError, match=r"another command writes to it .*; if that process is gone, delete .*\.a\.lock"):
+            locked(tmp_path / "a").__enter__()
+    with alone(tmp_path / "times.lock"):
+        assert (tmp_path / "times.lock").read_bytes()
+    assert [p.name for p in tmp_path.iterdir()] == []

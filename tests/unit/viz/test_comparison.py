@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from gpe_pl.metrics import Interval
-from gpe_pl.viz.comparison import comparison_figure
+from gpe_pl.viz.comparison import comparison_figure, parameter_figure
+from gpe_pl.viz.coverage import CoverageCurves, coverage_figure
 
 NEVER = float("inf")
 
@@ -25,3 +27,19 @@ def test_models_with_failed_rollouts_are_in_the_picture() -> None:
     assert {name: flat[name] for name in ("ballistic", "stops at walls")} == {"ballistic": 5.0, "stops at walls": 7.0}
     triangles = [line for line in axes.lines if line.get_marker() == "^"]
     assert [len(np.asarray(line.get_xdata())) for line in triangles] == [1, 0]  # GNS on fem
+
+
+def test_every_model_has_its_own_line() -> None:
+    curves = {"sand": {f"m{k}": {20.0: [1.0], 30.0: [2.0]} for k in range(12)}}
+    (axes,) = parameter_figure(curves, {}, "error").axes
+    lines = [line for line in axes.lines if str(line.get_label()).startswith("m")]
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 12
+    with pytest.raises(ValueError, match="29 curves, but no more than 28 can be told apart"):
+        parameter_figure({"sand": {f"m{k}": {20.0: [1.0]} for k in range(29)}}, {}, "error")
+
+
+def test_coverage_below_the_usual_range_is_in_the_picture() -> None:
+    bad = CoverageCurves(3, np.full((2, 4), 0.2), np.ones(4), np.ones(4))
+    figure = coverage_figure({"seen": bad}, [0.5, 0.9], 0.9, 0.1, {2: "0.2 s", 3: "0.3 s"})
+    for axes in figure.axes[:2]:
+        assert axes.get_ylim()[0] < 20.0

@@ -166,3 +166,12 @@ def test_no_two_curves_look_alike():
     assert len({(line.get_color(), line.get_linestyle()) for line in axes.lines}) == 20
     with pytest.raises(ValueError, match="told apart"):
         error_curve_figure({str(k): [np.ones(3)] for k in range(40)}, 1.0)
+
+
+def test_the_median_of_a_good_seed_and_one_that_diverged_is_no_number_between():
+    steps = np.arange(0, 1000, 100)
+    good, diverged = np.geomspace(1.0, 0.02, 10), np.where(steps < 400, 0.9, np.nan)
+    (axes,) = validation_loss_figure({"odd": [(steps, good), (steps + 1, diverged)]}).axes
+    at, median = axes.lines[2].get_data()
+    assert (np.asarray(median)[np.asarray(at) > 400] > axes.get_ylim()[1]).all()
+    assert (np.asarray(median)[np.asarray(at) <= 301] < 1.0).all()

@@ -2,7 +2,8 @@ import base64
 import json
 import re
 import zlib
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -150,3 +151,21 @@ def test_a_prediction_without_stress_has_none(tmp_path, mesh):
     fields = [t["fields"] for t in Page(tmp_path / "a.html").scene["trajectories"]]
     assert fields == [["pos", "speed", "von_mises"], ["pos", "speed"]]
     assert isinstance(mesh.stress, Stress)
+
+
+def test_obstacles_that_are_nodes_only_are_drawn_beside_walls_with_shapes(tmp_path):
+    from tests.unit.viz.conftest import falling
+
+    trajectory = falling(2)
+    assert trajectory.boundary.shapes
+    boundary = trajectory.boundary
+    ring = 0.5 + 0.1 * np.stack([np.cos(np.arange(12)), np.sin(np.arange(12))], axis=1)
+    columns = {f.name: getattr(boundary, f.name) for f in fields(boundary) if isinstance(getattr(boundary, f.name), np.ndarray)}
+    longer: dict[str, Any] = {k: np.concatenate([v, ring if k == "pos" else v[:1].repeat(12, axis=0)]) for k, v in columns.items()}
+    more = replace(boundary, **longer)
+    sizes = []
+    for number, own in enumerate((boundary, more)):
+        write_viewer(tmp_path / f"{number}.html", replace(trajectory, boundary=own))
+        sizes.append(len(Page(tmp_path / f"{number}.html").arrays["lines"]))
+    assert (sizes[1] - sizes[0]) % (4 * len(ring)) == 0
+    assert sizes[1] > sizes[0]
