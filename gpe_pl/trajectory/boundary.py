@@ -124,7 +124,7 @@ class Boundary:
             vel: velocity in m/s of walls that slide along themselves: one for all nodes [dim] or one per node [boundary_node, dim].
             friction: Coulomb coefficient, one for all nodes or one per node; ``schema.STICKY`` is no-slip.
             restitution: fraction of the normal velocity that a bounce returns, one for all nodes or one per node.
-            shapes: geometry of all walls, if known; containment, pictures and the elastic law use it instead of the points.
+            shapes: geometry of all walls, if known; containment and the elastic law use it instead of the points.
 
         Raises:
             ArrayError: an array has the wrong shape, a number is not finite or out of range, or a normal has length 0. The message names the node.

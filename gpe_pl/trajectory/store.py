@@ -52,6 +52,8 @@ OF_THE_MACHINE = {
     *(errno.ENOLCK, errno.ENOMEM, errno.ESTALE, errno.ETIMEDOUT),
 }
 """Error numbers that say nothing about the content of a file."""
+WITHOUT_A_LOCK = {errno.EACCES, errno.EAGAIN, errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}
+"""Error numbers of files that another program has locked, and of disks without locks."""
 
 
 class UnsoundError(StoreError):
@@ -233,7 +235,6 @@ def open_shard(path: Path | str) -> Iterator[h5py.File]:
     """Open a shard of this schema version for reading.
 
     Errors of the types that HDF5 raises on damaged files, such as ``OSError`` and ``ValueError``, become ``StoreError``. This includes errors in the block.
-    The file is not locked: shards are complete when they get their names, and some disks have no locks.
 
     Raises:
         StoreError: the file is missing, damaged, or of another schema.
@@ -243,7 +244,7 @@ def open_shard(path: Path | str) -> Iterator[h5py.File]:
     if not path.is_file():
         raise StoreError(f"{path}: no such file; generate data with `python -m gpe_pl.simulate`")
     try:
-        with h5py.File(path, "r", locking=False) as file:
+        with _opened(path) as file:
             version = attribute(file, "schema_version")
             if not isinstance(version, np.integer) or version != SCHEMA_VERSION:
                 raise StoreError(
@@ -257,6 +258,16 @@ def open_shard(path: Path | str) -> Iterator[h5py.File]:
         raise StoreError(
             f"{path}: not a readable HDF5 file (damaged or truncated: {error}); delete it and generate or import the data again"
         ) from error
+
+
+def _opened(path: Path) -> h5py.File:
+    """Open a file, without a lock if it cannot be locked: shards are complete when they get their names."""
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        if error.errno not in WITHOUT_A_LOCK:
+            raise
+    return h5py.File(path, "r", locking=False)
 
 
 def _require_machine(path: Path | str, error: Exception) -> None:

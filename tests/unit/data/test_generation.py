@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import errno
+import fcntl
 import hashlib
 import json
 import logging
@@ -114,7 +115,8 @@ def test_shards_that_the_machine_cannot_read_now_are_kept(folder, tmp_path, monk
     again = tmp_path / SPEC.name / SPEC.size
     shutil.copytree(folder, again)
     before, opened = contents(again), h5py.File
-    with h5py.File(again / "train" / "shard-00000.h5", "r+"):  # as a viewer has it
+    with open(again / "train" / "shard-00000.h5", "rb") as viewer:
+        fcntl.flock(viewer, fcntl.LOCK_EX)
         discard_damaged(tmp_path, SPEC)
     for error in (OSError(errno.EMFILE, "too many"), OSError(errno.EIO, "disk"), MemoryError("1.2 GiB")):
 

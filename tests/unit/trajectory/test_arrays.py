@@ -225,7 +225,7 @@ def test_boundary_points_without_a_shape_are_named(caplog: pytest.LogCaptureFixt
     for _ in range(2):
         trajectory(boundary=part)
     (said,) = caplog.messages
-    assert said.startswith("boundary: some nodes are on none of the shapes; containment, pictures and the elastic law see shapes only")
+    assert said.startswith("boundary: some nodes are on none of the shapes; containment and the elastic law see shapes only")
 
 
 def test_boundary_points_given_as_integers_are_positions() -> None:
