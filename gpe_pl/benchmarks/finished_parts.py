@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import gpe_pl
 from gpe_pl.files import sealed
 from gpe_pl.system.machine import commit
 
@@ -19,7 +21,14 @@ ADVICE = "delete it; the part is then measured again"
 
 @cache
 def _code() -> str:
-    return commit()
+    """Return the commit of the running code, with a digest of its files where the commit does not determine them."""
+    name = commit()
+    if name != "unknown" and not name.endswith("-dirty"):
+        return name
+    package, digest = Path(gpe_pl.__file__).parent, hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        digest.update(f"{path.relative_to(package).as_posix()} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+    return f"{name} {digest.hexdigest()[:16]}"
 
 
 @dataclass(frozen=True)

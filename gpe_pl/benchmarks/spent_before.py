@@ -19,11 +19,13 @@ class Simulated:
         fine: factor by which their solver divides the spacing of the nodes.
         num_nodes: number of nodes of a scene; NaN if the configuration does not name it.
         seconds: simulated time of all training scenes [s].
+        name: name, size and seed of the data set, by which data sets of equal size differ.
     """
 
     fine: int
     num_nodes: float
     seconds: float
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,8 @@ def _trainings(run: Run, runs: Sequence[Run]) -> list[Run] | None:
 def _simulated(run: Run) -> Simulated:
     count, frames, dt = (float(run.config.get(f"data.{key}", math.nan)) for key in ("num_train", "num_frames", "solver.frame_dt"))
     num_nodes = float(run.config.get("data.scene.num_particles", math.nan))
-    return Simulated(int(run.config.get("data.fine", 1)), num_nodes, count * (frames - 1) * dt)
+    name = " ".join(str(run.config.get(key)) for key in ("data.name", "size.name", "data.seed"))
+    return Simulated(int(run.config.get("data.fine", 1)), num_nodes, count * (frames - 1) * dt, name)
 
 
 def training_seconds(run: Run) -> float:

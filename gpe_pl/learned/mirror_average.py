@@ -16,6 +16,7 @@ import torch
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.reflection import Reflection, level_axes
+from gpe_pl.trajectory.rigid_bodies import moved_rigidly
 from gpe_pl.trajectory.state import State, Stress
 
 MAX_BOUNDARIES = 64
@@ -28,9 +29,11 @@ class MirrorAverage:
 
     Attributes:
         bounds: ``(low, high)`` of the domain per axis [m]. The images are mirrored at its middle.
+        dt: frame interval [s].
     """
 
     bounds: Sequence[tuple[float, float]]
+    dt: float
     _images: dict[tuple[int, tuple[Reflection, ...]], tuple[Boundary, list[Boundary]]] = field(default_factory=dict, repr=False)
 
     def next_states(
@@ -51,8 +54,8 @@ class MirrorAverage:
         plain = next_states([*states, *images])
         mirrored = iter(plain[len(states) :])
         return [
-            self._mean(state, [(reflection, next(mirrored)) for reflection in own])
-            for state, own in zip(plain[: len(states)], reflections, strict=True)
+            self._mean(before, state, [(reflection, next(mirrored)) for reflection in own])
+            for before, state, own in zip(states, plain[: len(states)], reflections, strict=True)
         ]
 
     def _reflections(self, state: State) -> list[Reflection]:
@@ -72,7 +75,7 @@ class MirrorAverage:
             known = self._images[key] = boundary, [reflection.boundary(boundary) for reflection in reflections]
         return known[1]
 
-    def _mean(self, state: State | SimulationError, images: list[tuple[Reflection, Any]]) -> State | SimulationError:
+    def _mean(self, before: State, state: State | SimulationError, images: list[tuple[Reflection, Any]]) -> State | SimulationError:
         if isinstance(state, SimulationError) or not images:
             return state
         if error := next((image for _, image in images if isinstance(image, SimulationError)), None):
@@ -85,11 +88,8 @@ class MirrorAverage:
         values = {"pos": pos, "vel": mean[0], "velocity_history": mean[1], "frame_velocity": mean[2]}
         if state.loads is not None:  # an average would round the given motion
             values = {name: v if v is None else state.loads.at_prescribed(getattr(state, name), v) for name, v in values.items()}
-        return replace(
-            state,
-            **values,
-            stress=Stress(_mean([s.node for s in stress]), _mean([s.cell for s in stress])) if stress else None,
-        )
+        stress_mean = Stress(_mean([s.node for s in stress]), _mean([s.cell for s in stress])) if stress else None
+        return moved_rigidly(before, replace(state, **values, stress=stress_mean), self.dt)  # a mean of rotations is smaller than the body
 
 
 def _mean(values: Sequence[Any]) -> Any:

@@ -98,7 +98,7 @@ class LearnedSimulator(nn.Module):
             raise GraphError("graph.stress=true: the model predicts no stress, which its next step reads; set model.stress=true")
         self.model, self.stride = model, stride
         self.builder = replace(builder, reads_relief=bool(model.settings.get("wall_layer")))
-        self._static_friction, self._averaged = 0.0, MirrorAverage(builder.metadata.bounds)
+        self._static_friction, self._averaged = 0.0, MirrorAverage(builder.metadata.bounds, builder.metadata.frame_dt)
         self._warned: set[str] = set()
         self._unknown: list[str | EdgeType] | None = None  # None: not determined yet
         self.standardizer = GraphStandardizer(builder.spec, builder.config.parameter_scale)

@@ -106,7 +106,7 @@ def test_without_gravity_no_image_has_its_floor_above(scene: tuple[LearnedSimula
         seen.extend(states)
         return list(states)
 
-    MirrorAverage(trajectory.metadata.bounds).next_states(
+    MirrorAverage(trajectory.metadata.bounds, trajectory.metadata.frame_dt).next_states(
         recorded, [replace(state, gravity=torch.zeros_like(state.gravity), boundary=floor)]
     )
     assert len(seen) == 2 ** (state.dim - 1)

@@ -115,6 +115,20 @@ def test_containment_moves_a_body_as_a_whole(backend: str) -> None:
     np.testing.assert_allclose(contained.vel - state.vel, (contained.pos - state.pos) / DT, atol=1e-9)
 
 
+def test_a_mirror_average_moves_bodies_rigidly() -> None:
+    truth = falling()
+    simulator = learned(builder_of(truth)).double()
+    simulator.acceleration_std.fill_(3000.0)
+    simulator.mirror_average = True
+    predicted = rollout(simulator, simulator.initial_state(truth, 2), 8, truth.metadata)
+    for found in distances(predicted):
+        assert np.abs(found - found[0]).max() < 1e-9 * found[0].max()
+    image = replace(truth, pos=np.concatenate([1 - truth.pos[..., :1], truth.pos[..., 1:]], axis=-1), vel=truth.vel * np.array([-1.0, 1.0]))
+    other = rollout(simulator, simulator.initial_state(image, 2), 8, truth.metadata)
+    np.testing.assert_allclose(1 - other.pos[..., 0], predicted.pos[..., 0], atol=1e-9)
+    assert np.ptp(predicted.pos[:, :16], axis=0).max() > SPACING
+
+
 def test_exported_programs_and_pages_refuse_rigid_bodies(tmp_path: Path) -> None:
     truth = falling()
     simulator = learned(builder_of(truth))

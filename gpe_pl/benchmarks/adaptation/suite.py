@@ -46,7 +46,7 @@ RESUMES = True
 SOLVER, SHIPPED, ADAPTED, SCRATCH = "solver", "shipped model", "adapted", "from scratch"
 MOST = 2
 """Largest number of scenes that an engine may be given, as a multiple of those that are needed."""
-HEADER = ["engine", "simulator", "RMS distance to the engine [spacings]", "over the shipped model", "seeds"]
+HEADER = ["engine", "simulator", "RMS distance to the engine [spacings]", "over the shipped model", "stopped", "seeds"]
 
 
 class AdaptationError(GpeError, RuntimeError):
@@ -114,8 +114,8 @@ def _of_engine(name: EngineName, own: OfEngine, candidate: Candidate, settings: 
     pairs, num_given_up = _made(name, candidate, settings, folder)
     dataset, tests = _stored(name, pairs, settings, folder), pairs[-settings.num_test :]
     start = candidate.simulator.builder.config.history
-    rows: list[tuple[str, int | None, list[float]]] = [
-        (SOLVER, None, [rms_distance(p.solver[start + 1 :], p.engine.pos[start + 1 :]) for p in tests])
+    rows: list[tuple[str, int | None, list[tuple[float, bool]]]] = [
+        (SOLVER, None, [(rms_distance(p.solver[start + 1 :], p.engine.pos[start + 1 :]), False) for p in tests])
     ]
     root = folder / "data" / dataset / FOLDER
     for who, values in measured(own.checkpoint, root, start).items():
@@ -126,7 +126,14 @@ def _of_engine(name: EngineName, own: OfEngine, candidate: Candidate, settings: 
             rows.append((who, seed, measured(str(checkpoint), root, start)[MODEL]))
     about = {"engine": name, "given_up": num_given_up}
     return [
-        about | {"simulator": who, "seed": seed, "rms": [round(x / candidate.spacing, 5) for x in values]} for who, seed, values in rows
+        about
+        | {
+            "simulator": who,
+            "seed": seed,
+            "rms": [round(x / candidate.spacing, 5) for x, _ in values],
+            "stopped": sum(s for _, s in values),
+        }
+        for who, seed, values in rows
     ]
 
 
@@ -165,14 +172,18 @@ def _stored(name: EngineName, pairs: Sequence[Pair], settings: Settings, folder:
     return dataset
 
 
-def measured(checkpoint: str, root: Path, start: int) -> dict[str, list[float]]:
-    """Return the RMS distance [m] of whole rollouts from frame ``start`` in each test scene, of a model (``MODEL``) and of the trivial baselines."""
-    simulator, found = LearnedSimulator.from_checkpoint(checkpoint), dict[str, list[float]]()
+def measured(checkpoint: str, root: Path, start: int) -> dict[str, list[tuple[float, bool]]]:
+    """Return the RMS distance [m] of rollouts from frame ``start`` in each test scene, of a model (``MODEL``) and of the trivial baselines.
+
+    With each distance comes whether the rollout stopped early. Nodes then stay where they were, which can be near the end of a scene that comes to rest.
+    """
+    simulator, found = LearnedSimulator.from_checkpoint(checkpoint), dict[str, list[tuple[float, bool]]]()
     settings = EvaluationSettings(splits=["test"], num_uncontained=0, num_pictures=0)
     for scene in Predictor(simulator, settings, MODEL, None, 1, start, seconds=[]).scenes(root, "test"):
         for name, prediction in scene.predictions.items():
             _, pos = lasting(prediction, scene.truth.num_frames)
-            found.setdefault(name, []).append(rms_distance(pos[1:], scene.truth.pos[1:]))
+            stopped = prediction.num_frames < scene.truth.num_frames
+            found.setdefault(name, []).append((rms_distance(pos[1:], scene.truth.pos[1:]), stopped))
     return found
 
 
@@ -196,7 +207,8 @@ def report(records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, st
         tables = _tables([record for record in records if record["engine"] == name])
         for who, (table, seeds) in tables.items():
             found = bootstrap_interval(table, statistic=pooled)
-            cells = [SCENES[name].label, who, f"{found.estimate:.3g} [{found.low:.3g}, {found.high:.3g}]", "", ", ".join(map(str, seeds))]
+            cells = [SCENES[name].label, who, f"{found.estimate:.3g} [{found.low:.3g}, {found.high:.3g}]", "", _stopped(records, name, who)]
+            cells.append(", ".join(map(str, seeds)))
             if who != SHIPPED:
                 ratio = bootstrap_ratio(table, tables[SHIPPED][0], statistic=pooled)
                 cells[3] = f"{ratio.estimate:.3g} [{ratio.low:.3g}, {ratio.high:.3g}]"
@@ -210,8 +222,8 @@ def report(records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, st
 
 NOTE = (
     "Whole rollouts on the engine's test scenes: RMS distance over frames, nodes and scenes, with its 95 % bootstrap interval over scenes and seeds, and the "
-    "ratio on the same scenes. Models start from some frames of the engine, the solver from its initial state. Adapted and from scratch have the same "
-    "trajectories and steps, and learning rates of their own."
+    "ratio on the same scenes. Stopped: number of rollouts that a guard ended; their nodes stay where they were. Models start from some frames of the engine, "
+    "the solver from its initial state. Adapted and from scratch have the same trajectories and steps, and learning rates of their own."
 )
 
 
@@ -244,6 +256,12 @@ def figures(records: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
 def pooled(table: np.ndarray, axis: tuple[int, int] = (-2, -1)) -> Any:
     """Return the root mean square of a table [..., seed, scene]."""
     return np.sqrt(np.square(table).mean(axis=axis))
+
+
+def _stopped(records: Sequence[Mapping[str, Any]], engine: str, who: str) -> str:
+    """Return the number of stopped rollouts of a simulator; records of earlier versions have none."""
+    found = [record.get("stopped") for record in records if (record["engine"], record["simulator"]) == (engine, who)]
+    return "not recorded" if None in found else str(sum(filter(None, found)))
 
 
 def _tables(records: Sequence[Mapping[str, Any]]) -> dict[str, tuple[np.ndarray, list[int]]]:

@@ -29,8 +29,9 @@ NUM_CROWDED = 20_000
 
 
 def has_finite_gradients(subject: Subject, state: State) -> bool:
-    """Tell whether the outputs are finite, and the gradients of their sum of squares with respect to all weights."""
+    """Tell whether the outputs are finite, and the gradients of sums of squares: of the outputs by all weights, of the next velocities by the positions."""
     model = subject.simulator.model
+    pos = state.pos.clone().requires_grad_()
     with torch.enable_grad():
         values = [*subject.simulator(subject.simulator.builder(state)).acceleration.values()]
         loss = torch.stack([v.square().sum() for v in values]).sum()
@@ -38,7 +39,11 @@ def has_finite_gradients(subject: Subject, state: State) -> bool:
         if loss.requires_grad:
             found = torch.autograd.grad(loss, [*model.parameters()], allow_unused=True)
             finite = finite and all(bool(torch.isfinite(g).all()) for g in found if g is not None)
-    return finite
+        (after,) = subject.simulator.next_states([replace(state, pos=pos)])
+        if isinstance(after, SimulationError):
+            raise after
+        (by_pos,) = torch.autograd.grad(after.vel.square().sum(), pos, allow_unused=True)
+    return finite and (by_pos is None or bool(torch.isfinite(by_pos).all()))
 
 
 @stress_test(12, "coincident particles", "4 nodes in one place: outputs and gradients are finite")

@@ -84,7 +84,11 @@ def compilations() -> int:
     return int(torch._dynamo.utils.counters["stats"]["unique_graphs"])
 
 
-@stress_test(28, "skipped work", "exact levels: change < 1e-6; sleeping: error after 20 steps ≤ 1.05 times that of computing everything")
+@stress_test(
+    28,
+    "skipped work",
+    "exact levels: change < 1e-6; sleeping, if 1 % sleep: error after 20 steps ≤ 1.05 times that of computing everything",
+)
 def skipping(subject: Subject) -> Outcome:
     changes = []
     for fraction in (0.1, 0.5, 0.9):
@@ -97,10 +101,12 @@ def skipping(subject: Subject) -> Outcome:
         changes.append(relative_change(untrimmed, everything))
     ratio, speed_up, fraction = sleeping(subject)
     slept = f"sleeping {ratio:.3f} times the error, {speed_up:.2f} times as fast, {100 * fraction:.2g} % asleep"
-    text = f"exact levels {largest(changes):.1e}; {slept if fraction > 0 else 'nothing fell asleep'}"
-    return Outcome(largest(changes) < 1e-6 and ratio <= 1.05, text)
+    slept = slept if fraction >= ENOUGH_ASLEEP else f"sleeping not judged, {100 * fraction:.2g} % asleep"
+    return Outcome(largest(changes) < 1e-6 and (fraction < ENOUGH_ASLEEP or ratio <= 1.05), f"exact levels {largest(changes):.1e}; {slept}")
 
 
+ENOUGH_ASLEEP = 0.01
+"""Fraction of particle-steps asleep from which the error of sleeping says something; below, both rollouts are nearly the same computation."""
 NOTHING = Skips(absent_types=False, static_boundary=False, isolated_nodes=False, edges_at_once=None)
 EXACT = (
     Skips(),

@@ -126,8 +126,8 @@ def test_what_is_trained_and_compared(tmp_path: Path, candidates: dict[EngineNam
         commands.append(command)
         return SimpleNamespace(returncode=0)
 
-    def found(checkpoint: str, *_: object) -> dict[str, list[float]]:
-        return {"model": [1e-3, 2e-3], "ballistic": [3e-3, 4e-3]}
+    def found(checkpoint: str, *_: object) -> dict[str, list[tuple[float, bool]]]:
+        return {"model": [(1e-3, False), (2e-3, True)], "ballistic": [(3e-3, False), (4e-3, False)]}
 
     monkeypatch.setattr(subprocess, "run", trained)
     monkeypatch.setattr(suite, "measured", found)
@@ -155,7 +155,8 @@ def test_what_is_trained_and_compared(tmp_path: Path, candidates: dict[EngineNam
         "test": 2,
     }
     assert "Kratos MPM gave up 1 further scenes" in table
-    assert next(line for line in table.splitlines() if "| adapted |" in line).endswith("| 1 [1, 1] | 0, 1 |")
+    assert next(line for line in table.splitlines() if "| adapted |" in line).endswith("| 1 [1, 1] | 2 | 0, 1 |")
+    assert next(line for line in table.splitlines() if "| ballistic |" in line).endswith("| 0 |  |")
     suite.run(settings(num_train=1), specs, tmp_path)  # other splits of the same scenes are another data set
     assert len(list((tmp_path / "data").iterdir())) == 2
 
@@ -191,9 +192,9 @@ def test_distances_are_pooled_and_compared_on_the_same_scenes() -> None:
     rows = [("solver", None, [3.0, 4.0]), ("shipped model", None, [6.0, 8.0]), ("adapted", 0, [3.0, 4.0]), ("adapted", 1, [3.0, 4.0])]
     records = [{"engine": "kratos", "given_up": 0, "simulator": who, "seed": seed, "rms": rms} for who, seed, rms in rows]
     lines = suite.report(records, []).splitlines()
-    assert lines[2] == "| Kratos MPM | solver | 3.54 [3, 4] | 0.5 [0.5, 0.5] |  |"
-    assert lines[3] == "| Kratos MPM | shipped model | 7.07 [6, 8] |  |  |"
-    assert lines[4] == "| Kratos MPM | adapted | 3.54 [3, 4] | 0.5 [0.5, 0.5] | 0, 1 |"
+    assert lines[2] == "| Kratos MPM | solver | 3.54 [3, 4] | 0.5 [0.5, 0.5] | not recorded |  |"
+    assert lines[3] == "| Kratos MPM | shipped model | 7.07 [6, 8] |  | not recorded |  |"
+    assert lines[4] == "| Kratos MPM | adapted | 3.54 [3, 4] | 0.5 [0.5, 0.5] | not recorded | 0, 1 |"
     assert "gave up" not in "".join(lines)
     (axes,) = suite.figures(records)["adaptation"].axes
     assert [label.get_text() for label in axes.get_xticklabels()] == ["solver", "shipped model", "adapted"]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+import gpe_pl
 from gpe_pl.benchmarks import finished_parts
 from gpe_pl.benchmarks.finished_parts import FinishedParts
 from gpe_pl.files.sealed import SealError
@@ -30,3 +31,16 @@ def test_a_damaged_part_is_refused_and_cleared(tmp_path: Path) -> None:
         parts.get({"test": 1})
     parts.clear()
     assert parts.get({"test": 1}) is None and not parts.folder.exists()
+
+
+def test_code_without_a_commit_of_its_own_is_known_by_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.py").write_text("LIMIT = 0.01")
+    monkeypatch.setattr(gpe_pl, "__file__", str(tmp_path / "__init__.py"))
+    found = []
+    for name in ("2d7fb3a", "2d7fb3a-dirty", "unknown"):
+        monkeypatch.setattr(finished_parts, "commit", lambda name=name: name)
+        for text in ("LIMIT = 0.01", "LIMIT = 0.5"):
+            (tmp_path / "a.py").write_text(text)
+            found.append(finished_parts._code.__wrapped__())
+    assert found[:2] == ["2d7fb3a", "2d7fb3a"]
+    assert len(set(found)) == 5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,8 @@ def test_trainings_that_a_model_started_from_and_tuning_count_too(tmp_path: Path
     first = run_in(tmp_path / "first", 100)
     second = run_in(tmp_path / "second", 60, settings={"start_from": fingerprint(first.folder), "data.fine": 2, "data.num_train": 4})
     trial = run_in(tmp_path / "trial", 20)
-    coarse, fine = Simulated(1, 150.0, 5.0), Simulated(2, 150.0, 2.0)
+    coarse, fine = (simulated[0] for simulated in (spent_on(run, [first, second]).data for run in (first, second)))
+    assert (replace(coarse, name=""), replace(fine, name="")) == (Simulated(1, 150.0, 5.0), Simulated(2, 150.0, 2.0))
     assert spent_on(first, [first, second]) == Spent(50.0, (coarse,))
     assert spent_on(second, [second, first]) == Spent(80.0, (fine, coarse))
     assert spent_on(second, [second], tuning=[trial, first]) == Spent(90.0, (fine, coarse))
@@ -58,3 +60,10 @@ def test_data_cost_what_their_solver_takes() -> None:
     assert spent.seconds({2: 10.0, 1: 1.0}, 300.0) == pytest.approx(80 + 12.5)
     assert spent.seconds({2: 10.0, 1: 1.0}, math.nan) == pytest.approx(105)
     assert math.isnan(spent.seconds({1: 1.0}, 150.0))
+
+
+def test_data_sets_of_equal_size_are_two(tmp_path: Path) -> None:
+    first = run_in(tmp_path / "first", 100)
+    second = run_in(tmp_path / "second", 60, settings={"start_from": fingerprint(first.folder), "data.name": "steep"})
+    third = run_in(tmp_path / "third", 60, settings={"start_from": fingerprint(second.folder)})
+    assert [data.seconds for data in spent_on(third, [first, second]).data] == [5.0, 5.0]

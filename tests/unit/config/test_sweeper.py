@@ -154,5 +154,5 @@ def test_a_journal_whose_last_line_was_cut_off_keeps_its_trials(tmp_path: Path, 
     for num_trials in (4, 5):
         launcher = Launcher()
         sweeper(tmp_path, launcher, num_trials=num_trials).sweep([])
-        assert len(launcher.jobs) <= 2
+        assert 0 < len(launcher.jobs) < num_trials  # the other trials are known
     assert caplog.text.count("optuna.log: its last line was not finished and is dropped") == 1

@@ -2,8 +2,6 @@
 
 import contextlib
 import dataclasses
-import errno
-import fcntl
 import hashlib
 import json
 import logging
@@ -44,7 +42,7 @@ from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.scenes import BodyScene
 from gpe_pl.system.locks import FolderError
 from gpe_pl.system.progress import progress_bar
-from gpe_pl.trajectory.store import ReadError, iter_trajectories, read_trajectory
+from gpe_pl.trajectory.store import iter_trajectories, read_trajectory
 from tests.runs import compose
 
 DENSITY = {"sand": 1600.0, "snow": 400.0, "elastomer": 1000.0}
@@ -109,26 +107,6 @@ def test_resume_equals_uninterrupted(folder, tmp_path, num_workers):
     generate(tmp_path, SPEC, num_workers)
     assert contents(again) == contents(folder) and not half.exists()
     assert (again / "train" / "shard-00000.h5").stat().st_mtime_ns == kept
-
-
-def test_shards_that_the_machine_cannot_read_now_are_kept(folder, tmp_path, monkeypatch):
-    again = tmp_path / SPEC.name / SPEC.size
-    shutil.copytree(folder, again)
-    before, opened = contents(again), h5py.File
-    with open(again / "train" / "shard-00000.h5", "rb") as viewer:
-        fcntl.flock(viewer, fcntl.LOCK_EX)
-        discard_damaged(tmp_path, SPEC)
-    for error in (OSError(errno.EMFILE, "too many"), OSError(errno.EIO, "disk"), MemoryError("1.2 GiB")):
-
-        def fails(*args, error=error, **kwargs):
-            raise error
-
-        monkeypatch.setattr(h5py, "File", fails)
-        for use in (discard_damaged, generate):
-            with pytest.raises(ReadError, match=r"shard-0000\d\.h5: cannot be read"):
-                use(tmp_path, SPEC)
-        monkeypatch.setattr(h5py, "File", opened)
-    assert contents(again) == before
 
 
 def test_damage_in_place_is_found_and_repaired(folder, tmp_path, caplog):
