@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -63,6 +63,7 @@ def identify_scenes(cfg: DictConfig) -> None:
     shooting, search = construct(ShootingSettings, cfg.shooting, "shooting"), construct(SearchSettings, cfg.search, "search")
     simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint, set_up(construct(TrainerSettings, cfg.trainer, "trainer")))
     folder = Path(cfg.paths.runs) / run_name(cfg.name)
+    calibrations, calibrated_on = _calibrations(cfg, settings)
     task = Task(
         simulator,
         settings.unknowns,
@@ -72,10 +73,11 @@ def identify_scenes(cfg: DictConfig) -> None:
         observations,
         shooting,
         search,
-        *_calibrations(cfg, settings),
+        calibrations,
+        calibrated_on,
     )
     with locked(folder), recorded(folder, "identify", sys.argv[1:], cfg.paths.runs):
-        claim(folder, _identity(cfg), results=["scenes/*"])
+        claim(folder, _identity(cfg, calibrated_on), results=["scenes/*"])
         with without_orphans(folder):
             for name, trajectory in scenes(Path(settings.trajectory), settings.num_scenes):
                 for line in task.run(name, trajectory, folder):
@@ -151,13 +153,19 @@ def _plain(cfg: DictConfig) -> dict[str, Any]:
     return values
 
 
-def _identity(cfg: DictConfig) -> dict[str, Any]:
-    """Return the settings on which answers depend. If one differs, the run needs another folder."""
+def _identity(cfg: DictConfig, calibrated_on: Collection[str] = ()) -> dict[str, Any]:
+    """Return what answers depend on. If something differs, the run needs another folder.
+
+    Args:
+        cfg: configuration of the command.
+        calibrated_on: digests of the motions of the calibration, whose folder can gain scenes.
+    """
     from gpe_pl.learned.pretrained import fingerprint
 
     values = _plain(cfg)
     kept = ("unknowns", "per_body", "bounds", "calibration", "level", "observations", "shooting", "search", "trajectory")
-    return {"checkpoint": fingerprint(cfg.checkpoint), **{key: values[key] for key in kept}}
+    calibration = {"calibrated_on": sorted(calibrated_on)} if calibrated_on else {}
+    return {"checkpoint": fingerprint(cfg.checkpoint), **{key: values[key] for key in kept}, **calibration}
 
 
 main = entry_point("identify")(identify_scenes)

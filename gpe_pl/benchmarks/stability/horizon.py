@@ -64,7 +64,7 @@ def long_horizon(subject: Subject) -> Outcome:
     growth = max(float(e.max() / max(e[0], 1e-300)) for e in energies)
     stops = [r.termination for r in results if r.termination is not None]
     valid = [valid_steps(r, truth.frames(subject.history), subject.spacing) for r, truth in zip(results, subject.scenes, strict=True)]
-    survived = {f: np.mean([r.num_frames - 1 >= f * (t.num_frames - 1) for r, t in zip(results, subject.scenes, strict=True)])
+    survived = {f: np.mean([r.num_frames - 1 >= round(f * (t.num_frames - 1)) for r, t in zip(results, subject.scenes, strict=True)])
                 for f in subject.horizon_factors}  # fmt: skip
     text = [
         f"alive at {', '.join(f'{f:g}×: {100 * s:.0f} %' for f, s in survived.items())} of {len(results)} scenes",

@@ -438,6 +438,8 @@ def test_a_calibration_of_another_search_is_refused(tmp_path: Path, there: dict[
     sealed.write(tmp_path / "config.json", _identity(cfg))
     found, known = _calibrations(cfg, settings)
     assert found.keys() == {"solver"} and len(known) == 9
+    identify_parameters(Drag(), thrown(40.0), bounds=BOUNDS, scene="scene9").write(tmp_path)
+    assert _identity(cfg, _calibrations(cfg, settings)[1]) != _identity(cfg, known)  # more scenes there, so other intervals
     sealed.write(tmp_path / "config.json", {**_identity(cfg), **there})
     with pytest.raises(ConfigError, match=f"was made with other settings .{name}: "):
         _calibrations(cfg, settings)
