@@ -10,12 +10,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import gpe_pl
 from gpe_pl.files import sealed
 from gpe_pl.system.machine import commit
 
 PARTS = "parts"
 """Subfolder of a suite's results for the files of finished parts."""
+PACKAGE = Path(__file__).resolve().parents[1]
+"""Folder of the running code."""
 ADVICE = "delete it; the part is then measured again"
 
 
@@ -25,9 +26,9 @@ def _code() -> str:
     name = commit()
     if name != "unknown" and not name.endswith("-dirty"):
         return name
-    package, digest = Path(gpe_pl.__file__).parent, hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        digest.update(f"{path.relative_to(package).as_posix()} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+    digest = hashlib.sha256()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        digest.update(f"{path.relative_to(PACKAGE).as_posix()} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
     return f"{name} {digest.hexdigest()[:16]}"
 
 

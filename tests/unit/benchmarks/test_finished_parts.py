@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-import gpe_pl
 from gpe_pl.benchmarks import finished_parts
 from gpe_pl.benchmarks.finished_parts import FinishedParts
 from gpe_pl.files.sealed import SealError
@@ -35,7 +34,7 @@ def test_a_damaged_part_is_refused_and_cleared(tmp_path: Path) -> None:
 
 def test_code_without_a_commit_of_its_own_is_known_by_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.py").write_text("LIMIT = 0.01")
-    monkeypatch.setattr(gpe_pl, "__file__", str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(finished_parts, "PACKAGE", tmp_path)
     found = []
     for name in ("2d7fb3a", "2d7fb3a-dirty", "unknown"):
         monkeypatch.setattr(finished_parts, "commit", lambda name=name: name)
