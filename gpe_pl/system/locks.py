@@ -141,10 +141,9 @@ def _taken(path: Path, take: Callable[[BaseFileLock], object]) -> BaseFileLock:
         except OSError as error:
             if isinstance(error, Timeout) or error.errno not in WITHOUT_LOCKS:
                 raise FolderError(f"{path}: cannot be locked ({error.strerror or error}); choose a folder that can be written") from None
+            # the first kind makes the file before it finds that there are no locks; the second kind would take it for that of another process
             if not was_there and path.exists() and not path.stat().st_size:
-                path.unlink(
-                    missing_ok=True
-                )  # the first kind made it before it found that there are no locks; the second would wait for its owner
+                path.unlink(missing_ok=True)
     raise FolderError(f"{path}: the disk has no locks; choose a folder on another disk")
 
 

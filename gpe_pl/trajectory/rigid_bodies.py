@@ -101,11 +101,10 @@ def rigid_modes(pos: Array, mass: Array) -> Array:
         turns = xp.stack([-arm[:, 1], arm[:, 0]], axis=1)[None]
     else:
         turns = xp.stack([_cross(axes[k] + 0 * arm, arm) for k in range(dim)])
-    trace = xp.sum(weight * arm**2) + TINY
-    inertia = xp.sum(weight * turns[:, None] * turns[None], axis=(2, 3)) + NO_INERTIA * trace * xp.eye(
-        len(turns), dtype=arm.dtype, device=device(arm)
-    )
-    factor = xp.linalg.cholesky(inertia)
+    limits = xp.finfo(arm.dtype)
+    least = max(NO_INERTIA, 4 * float(limits.eps)) * xp.sum(weight * arm**2) + float(limits.smallest_normal)
+    inertia = xp.sum(weight * turns[:, None] * turns[None], axis=(2, 3))
+    factor = xp.linalg.cholesky(inertia + least * xp.eye(len(turns), dtype=arm.dtype, device=device(arm)))
     turns = xp.linalg.solve(factor, xp.reshape(turns, (len(turns), -1)))
     return xp.concat([shifts, xp.reshape(turns, (-1, *arm.shape))])
 

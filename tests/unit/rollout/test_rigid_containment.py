@@ -187,8 +187,16 @@ def test_modes_are_orthonormal_and_rigid() -> None:
         np.testing.assert_allclose(gram, np.eye(number), atol=1e-9)
         for mode in modes:
             assert np.abs(pdist(pos + 1e-6 * mode) - pdist(pos)).max() < 1e-10
-    rod = rigid_modes(np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.ones(2))
-    assert np.isfinite(rod).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_bodies_without_inertia_along_an_axis_have_finite_modes(dtype: type[np.floating]) -> None:
+    row = 0.3 + np.outer(np.linspace(0, 1, 5), [0.6, 0.5, 0.4])
+    for pos in (row, row[:1], row[:, :2], row[:1, :2]):
+        modes = rigid_modes(pos.astype(dtype), np.ones(len(pos), dtype))
+        assert modes.dtype == dtype
+        assert np.isfinite(modes).all()
+        assert np.abs(modes).max() < 10
 
 
 def test_too_many_iterations_mean_no_motion(monkeypatch: pytest.MonkeyPatch) -> None:
