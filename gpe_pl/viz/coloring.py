@@ -73,34 +73,50 @@ class Coloring:
         trajectories: all trajectories in the figure.
         frames: the frames in the figure.
         truth: ground truth, for ``error``.
+        by_node: whether meshes are painted by the values of their nodes, as in the viewer, instead of their cells, as in pictures.
+
+    Attributes:
+        scale: range of values from the first to the last colour.
+        is_exceeded: whether a painted value is above the end of the scale, whose colour then means that value and all above.
 
     Raises:
         ValueError: ``von_mises`` if no trajectory has a stress, or ``error`` without ground truth.
     """
 
-    def __init__(self, by: ColorBy, trajectories: Sequence[Trajectory], frames: Iterable[int], truth: Trajectory | None = None) -> None:
+    def __init__(
+        self, by: ColorBy, trajectories: Sequence[Trajectory], frames: Iterable[int], truth: Trajectory | None = None, by_node: bool = False
+    ) -> None:
         if by == "error" and truth is None:
             raise ValueError("colour by error needs the ground truth")
         if by == "von_mises" and all(t.stress is None for t in trajectories):
             raise ValueError("colour by von_mises needs a stress, which no trajectory has")
         self.by, self._truth = by, truth
         self.color_map: Colormap = COLOR_MAPS[by].with_extremes(bad=REFERENCE)
-        self.scale: Normalize = self._scale(trajectories, list(frames))
+        painted = self._painted(trajectories, [0] if by == "height" else list(frames), by_node)
+        self.scale: Normalize = self._scale(painted, trajectories[0].metadata.spacing)
+        self.is_exceeded: bool = any(bool((values > self.scale.vmax).any()) for values in painted)
 
-    def _scale(self, trajectories: Sequence[Trajectory], frames: list[int]) -> Normalize:
+    def _painted(self, trajectories: Sequence[Trajectory], frames: list[int], by_node: bool) -> list[Float[np.ndarray, "value"]]:
+        """Return the finite values that are painted, as a group of nodes and one of cells. Only a stress can differ between a cell and its corners."""
+        nodes, cells = [np.empty(0)], [np.empty(0)]
+        for trajectory in trajectories:
+            meshed = trajectory.cells if self.by == "von_mises" and not by_node else None
+            loose = np.setdiff1d(np.arange(trajectory.num_nodes), np.empty(0, int) if meshed is None else meshed)
+            for frame in (f for f in frames if f < trajectory.num_frames):
+                of_nodes, of_cells = self.values(trajectory, frame)
+                nodes.append(of_nodes[loose])
+                cells.append(of_cells if meshed is not None else np.empty(0))
+        return [values[np.isfinite(values)] for values in map(np.concatenate, (nodes, cells))]
+
+    def _scale(self, painted: list[Float[np.ndarray, "value"]], least: float) -> Normalize:
         if self.by == "material":
             return Normalize(-0.5, len(MATERIALS) - 0.5)
         if self.by == "height":
-            frames = [0]
-        pairs = (self.values(t, f) for t in trajectories for f in frames if f < t.num_frames)
-        shown = [cells if self.by == "von_mises" and len(cells) else nodes for nodes, cells in pairs]
-        values = np.concatenate([np.empty(0), *shown])
-        values = values[np.isfinite(values)]
-        if self.by == "height":
-            return Normalize(float(values.min()), float(values.max()))
-        # End at the 99th percentile: otherwise a single lost particle would take all contrast from the others.
-        top = float(np.quantile(np.append(values, 0.0), 0.99))
-        return Normalize(0.0, top if top > 0 else trajectories[0].metadata.spacing)
+            return Normalize(float(painted[0].min()), float(painted[0].max()))
+        # End at the 99th percentile: otherwise a single lost particle would take all contrast from the others. Particles and cells have one each, or a fine
+        # mesh would hide the stress of a few particles.
+        top = max(float(np.quantile(np.append(values, 0.0), 0.99)) for values in painted)
+        return Normalize(0.0, top if top > 0 else least)
 
     @property
     def bar_label(self) -> str | None:

@@ -134,7 +134,7 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
     frames = range(0, truth.num_frames, stride)
     shown = {name: _inside(t.frames(0, truth.num_frames)) for name, t in trajectories.items()}
     raster = Raster.of([t.pos[::stride] for t in shown.values()], np.asarray(about.bounds, float))
-    colorings = {by: Coloring(by, [*shown.values()], frames, shown[first]) for by in _colors(shown)}
+    colorings = {by: Coloring(by, [*shown.values()], frames, shown[first], by_node=True) for by in _colors(shown)}
     steps = {by: _step(by, colorings[by], shown, frames) for by in ("speed", "von_mises") if by in colorings}
     codes = np.unique(truth.node_type).tolist()
     vertical = vertical_axis(truth)
@@ -265,7 +265,8 @@ def _rmse(prediction: Trajectory, truth: Trajectory, frames: Sequence[int]) -> l
 
 def _color(by: ColorBy, coloring: Coloring) -> dict[str, Any]:
     name, unit = UNITS[by]
-    return {"by": by, "name": name, "label": name, "unit": unit, "low": coloring.scale.vmin, "high": coloring.scale.vmax}
+    low, high = coloring.scale.vmin, coloring.scale.vmax
+    return {"by": by, "name": name, "label": name, "unit": unit, "low": low, "high": high, "isExceeded": coloring.is_exceeded}
 
 
 def _color_map(coloring: Coloring) -> np.ndarray:

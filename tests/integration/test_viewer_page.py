@@ -133,6 +133,15 @@ def test_a_mesh_is_coloured_by_its_stress(opened: Any, mesh: Trajectory) -> None
     assert viewer.page.locator(".bar").inner_text().split("\n")[1] == "von Mises stress"
 
 
+def test_a_colour_bar_marks_values_above_its_end(opened: Any) -> None:
+    truth = falling(2)
+    vel = np.ones_like(truth.vel)
+    vel[3, 0] = 50.0
+    viewer = opened(replace(truth, vel=vel))
+    viewer.page.select_option("#color", "speed")
+    assert viewer.page.locator(".bar").inner_text().split("\n") == ["0 m/s", "speed", "≥ 1.41 m/s"]
+
+
 def test_cells_do_not_stretch_across_a_periodic_domain(opened: Any) -> None:
     mesh = falling_mesh(2)
     metadata = replace(mesh.metadata, periodic=(True, False))

@@ -177,12 +177,13 @@ class Viewer {
         legend.append(entry);
       }
     } else if (panel.by !== "error" || panel.of !== this.truth) {
-      const { label, unit, low, high } = this.colors[panel.by], map = this.arrays[`map_${panel.by}`];
+      const { label, unit, low, high, isExceeded } = this.colors[panel.by], map = this.arrays[`map_${panel.by}`];
       const bar = add("div", "bar"), stops = [];
       for (let k = 0; k < 256; k += 15) stops.push(`rgb(${map[3 * k]},${map[3 * k + 1]},${map[3 * k + 2]})`);
       const strip = document.createElement("i");
       strip.style.background = `linear-gradient(to right, ${stops.join(",")})`;
-      bar.append(strip, ...[withUnit(low, unit), label, withUnit(high, unit)].map((text) => Object.assign(document.createElement("span"), { textContent: text })));
+      const end = `${isExceeded ? "≥ " : ""}${withUnit(high, unit)}`; // its colour also means all values above
+      bar.append(strip, ...[withUnit(low, unit), label, end].map((text) => Object.assign(document.createElement("span"), { textContent: text })));
     }
     panel.stopped = add("div", "stopped");
     panel.ring = add("div", "ring");

@@ -42,6 +42,34 @@ def test_stress_has_one_scale_for_all_rows(mesh):
     np.testing.assert_allclose(coloring.values(mesh, 3)[1], mesh.stress.cell_von_mises[3], rtol=1e-6)
 
 
+def stressed_beside(mesh, of_cells: float, of_particles: float):
+    """Return the mesh with constant stresses [Pa] of its cells and of the particles beside it, and with a peak at its node 0."""
+    node, cell = np.zeros_like(mesh.stress.node), np.zeros_like(mesh.stress.cell)
+    cell[..., 0], node[:, :, 0] = of_cells, of_particles
+    node[:, np.unique(mesh.cells), 0] = of_cells
+    node[:, 0, 0] = 4 * of_cells
+    metadata = replace(mesh.metadata, materials=("solid", "snow"), param_names=("youngs_modulus", "hardening_coefficient"))
+    metadata = replace(metadata, stress_materials=("snow",))
+    types = np.where(np.isin(np.arange(mesh.num_nodes), mesh.cells), node_code("solid"), node_code("snow")).astype(np.uint8)
+    params = np.ones((mesh.num_nodes, 2))
+    return replace(mesh, metadata=metadata, node_type=types, material_params=params, stress=Stress(node, cell))
+
+
+def test_the_scale_of_stress_covers_cells_and_the_particles_beside_them(mesh):
+    for of_cells, of_particles in ((1e4, 1e6), (1e6, 1e4)):
+        mixed = stressed_beside(mesh, of_cells, of_particles)
+        nodes, cells = Coloring("von_mises", [mixed], [0]).values(mixed, 0)
+        assert np.isclose(nodes, of_particles).sum() == 2 and np.isclose(cells, of_cells).all()
+        assert Coloring("von_mises", [mixed], [0]).scale.vmax == pytest.approx(1e6)
+
+
+def test_a_mesh_painted_by_its_nodes_has_the_scale_of_their_values(mesh):
+    mixed = stressed_beside(mesh, 1e4, 1e4)
+    by_cell, by_node = (Coloring("von_mises", [mixed], [0], by_node=by_node) for by_node in (False, True))
+    assert by_cell.scale.vmax == pytest.approx(1e4) and not by_cell.is_exceeded
+    assert 3e4 < by_node.scale.vmax < 4e4 and by_node.is_exceeded
+
+
 def test_what_has_no_stress_is_neutral(mesh):
     loose = np.setdiff1d(np.arange(mesh.num_nodes), mesh.cells)
     coloring = Coloring("von_mises", [mesh], [0, 1])

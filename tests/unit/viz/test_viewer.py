@@ -62,6 +62,21 @@ def test_quantities_come_back_and_say_where_there_is_none(tmp_path, mesh):
     assert page.scene["colors"][0]["by"] == "von_mises"
 
 
+def test_a_scale_says_whether_values_exceed_it(tmp_path, mesh):
+    node = np.zeros_like(mesh.stress.node)
+    node[:, mesh.cells[0, 0], 0] = 8e5  # of one node, so the mean of each cell is lower
+    vel = np.ones_like(mesh.vel)
+    write_viewer(tmp_path / "a.html", replace(mesh, vel=vel, stress=Stress(node, mesh.stress.cell)))
+    colors = {color["by"]: color for color in Page(tmp_path / "a.html").scene["colors"]}
+    assert colors["von_mises"]["isExceeded"] == (colors["von_mises"]["high"] < 8e5)
+    assert colors["von_mises"]["high"] > 2e5
+    assert not any(colors[by]["isExceeded"] for by in ("speed", "height", "material"))
+    vel[3, 0] = 50.0
+    write_viewer(tmp_path / "a.html", replace(mesh, vel=vel))
+    (speed,) = (color for color in Page(tmp_path / "a.html").scene["colors"] if color["by"] == "speed")
+    assert speed["isExceeded"] and speed["high"] < 50
+
+
 def test_what_exploded_is_left_out_and_takes_no_precision(tmp_path, ground_truth):
     pos, vel = ground_truth.pos.copy(), ground_truth.vel.copy()
     vel[...] = 1.0
