@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl.schema import MATERIALS, MaterialParameter, node_code, parameters_by_name
+from gpe_pl.schema import BOUNDARY, MATERIALS, MaterialParameter, node_code, parameters_by_name
 from gpe_pl.trajectory.trajectory import Trajectory
 
 UNITS = {"1": "", "deg": "°", "m^2/s": " m²/s"}
@@ -41,6 +41,23 @@ def pictured(first: Trajectory, others: Mapping[str, Trajectory]) -> dict[str, T
     """Return ``with_heading`` with moving boundary nodes as nodes, and NaN as the position of nodes that are not in an open scene."""
     named = with_heading(first, others)
     return {name: t.with_nodes_of(first).with_moving_boundary().with_absent_hidden() for name, t in named.items()}
+
+
+def hidden_nodes(trajectory: Trajectory, frame: int) -> list[str]:
+    """Return how many nodes a picture of a frame does not show: ``20 of 48 nodes are outside``, ``3 of 48 nodes are missing``; empty if it shows all.
+
+    A node is outside if it is farther outside the domain than a rest spacing, and missing if its position is not finite. Moving walls do not count, nor do
+    nodes that are not in an open scene in this frame.
+    """
+    metadata = trajectory.metadata
+    counted = trajectory.node_type != node_code(BOUNDARY)
+    if trajectory.alive is not None:
+        counted &= trajectory.alive[frame]
+    pos = metadata.periodicity.wrapped(trajectory.pos[frame, counted].astype(np.float64))
+    low, high = np.asarray(metadata.bounds, float).T
+    missing = ~np.isfinite(pos).all(axis=1)
+    outside = ((pos < low - metadata.spacing) | (pos > high + metadata.spacing)).any(axis=1) & ~missing
+    return [f"{mask.sum()} of {len(pos)} nodes are {what}" for mask, what in ((outside, "outside"), (missing, "missing")) if mask.any()]
 
 
 def parameter_name(parameter: MaterialParameter) -> str:

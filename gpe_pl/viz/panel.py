@@ -7,10 +7,11 @@ from jaxtyping import Float
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from gpe_pl.schema import BOUNDARY, CELL_KINDS, node_code
+from gpe_pl.schema import CELL_KINDS
 from gpe_pl.trajectory.cells import kinds_of, stacked
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
+from gpe_pl.viz.captions import hidden_nodes
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.scenery import INK, LIGHT, draw_scenery
 
@@ -139,7 +140,7 @@ class Panel:
         if frame < self.trajectory.num_frames:
             pos = self.trajectory.metadata.periodicity.wrapped(self.trajectory.pos[frame].astype(np.float64))
             self._show(pos, *self.coloring(self.trajectory, frame))
-            self.note.set_text(self._outside(pos))
+            self.note.set_text("\n".join(hidden_nodes(self.trajectory, frame)).replace(" are", "\nare"))
             self.note.set_y(0.85)  # above most of the motion
             return
         self._show(np.full(self.trajectory.pos.shape[1:], np.nan), *self.coloring(self.trajectory, 0))
@@ -149,14 +150,6 @@ class Panel:
             self.note.set_text("not simulated")
         else:
             self.note.set_text(f"stopped at {stop.frame * self.trajectory.metadata.frame_dt:.2f} s\n({stop.reason})")
-
-    def _outside(self, pos: Float[np.ndarray, "node dim"]) -> str:
-        """Return how many nodes are farther outside the domain than a rest spacing, where the panel does not show them; empty if none is."""
-        metadata = self.trajectory.metadata
-        low, high = np.asarray(metadata.bounds, float).T
-        moves = self.trajectory.node_type != node_code(BOUNDARY)
-        beyond = ((pos < low - metadata.spacing) | (pos > high + metadata.spacing)).any(axis=1) & moves
-        return f"{int(beyond.sum())} of {int(moves.sum())} nodes\nare outside" if beyond.any() else ""
 
     def _show(
         self, pos: Float[np.ndarray, "node dim"], node_colors: Float[np.ndarray, "node 4"], cell_colors: Float[np.ndarray, "cell 4"]

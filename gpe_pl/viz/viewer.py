@@ -30,7 +30,7 @@ from gpe_pl.geometry.shapes import Bowl, signed_distance
 from gpe_pl.schema import BOUNDARY, NODE_TYPES, node_code
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import AZIMUTH, ELEVATION, vertical_axis
-from gpe_pl.viz.captions import describe, heading, pictured, with_heading
+from gpe_pl.viz.captions import describe, heading, hidden_nodes, pictured, with_heading
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error
 from gpe_pl.viz.contact_sheet import informative_color
 from gpe_pl.viz.panel import DOT, drawn_faces, outline, polygon_edges
@@ -80,7 +80,8 @@ def write_viewer(
         title: title of the page; by default data set and split.
 
     Returns:
-        The largest rounding of a shown position [m]. Nodes further outside the domain than its size are not shown.
+        The largest rounding of a shown position [m]. Nodes further outside the domain than its size are not shown; panels say how many nodes are outside
+        the domain or have no position.
 
     Raises:
         ViewerError: a prediction has other nodes than the ground truth.
@@ -177,6 +178,7 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
                 "name": name,
                 "frames": len(kept),
                 "fields": [*fields],
+                "notes": [", ".join(hidden_nodes(trajectory, frame)) for frame in kept],
                 "stopped": "not simulated" if stop is None else f"stopped at {stop.frame * about.frame_dt:.2f} s ({stop.reason})",
                 "rmse": None if number == 0 else _rmse(trajectory, shown[first], frames),
             }
@@ -253,14 +255,11 @@ def _levels(values: Float[np.ndarray, "frame node"], step: float) -> UInt16[np.n
 
 
 def _rmse(prediction: Trajectory, truth: Trajectory, frames: Sequence[int]) -> list[float | None]:
-    """Return the root mean square of the position error [m] in each frame, or None where the prediction has ended."""
+    """Return the root mean square of the position error [m] in each frame over the nodes that both have, or None if there are none."""
     free = truth.node_type != node_code(BOUNDARY)
-    known = [f for f in frames if f < prediction.num_frames]
-    errors = [np.nan] * len(frames)
-    for k, frame in enumerate(known):
-        both = free if truth.alive is None or prediction.alive is None else free & truth.alive[frame] & prediction.alive[frame]
-        errors[k] = float(np.sqrt(np.mean(position_error(prediction, truth, frame)[both] ** 2))) if both.any() else np.nan
-    return [float(e) if np.isfinite(e) else None for e in errors]
+    errors = [position_error(prediction, truth, frame)[free] if frame < prediction.num_frames else np.empty(0) for frame in frames]
+    known = [error[np.isfinite(error)] for error in errors]
+    return [float(np.sqrt(np.mean(error**2))) if len(error) else None for error in known]
 
 
 def _color(by: ColorBy, coloring: Coloring) -> dict[str, Any]:

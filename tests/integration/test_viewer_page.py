@@ -142,6 +142,18 @@ def test_a_colour_bar_marks_values_above_its_end(opened: Any) -> None:
     assert viewer.page.locator(".bar").inner_text().split("\n") == ["0 m/s", "speed", "≥ 1.41 m/s"]
 
 
+def test_panels_say_how_many_nodes_they_do_not_show(opened: Any) -> None:
+    truth = falling(2)
+    pos = truth.pos.copy()
+    pos[6:, :3], pos[8:, 3:5] = [0.5, 1.4], np.nan
+    viewer = opened(truth, GPE=replace(truth, pos=pos))
+    notes = viewer.page.locator(".title > span")
+    for frame, expected in ((5, ""), (7, "3 of 25 nodes are outside"), (8, "3 of 25 nodes are outside, 2 of 25 nodes are missing")):
+        viewer.page.locator("#frame").fill(str(frame))
+        assert notes.all_inner_texts() == ["", expected, expected]
+    assert "rms" in viewer.page.locator("#time").inner_text()
+
+
 def test_cells_do_not_stretch_across_a_periodic_domain(opened: Any) -> None:
     mesh = falling_mesh(2)
     metadata = replace(mesh.metadata, periodic=(True, False))

@@ -160,14 +160,17 @@ class Viewer {
     this.draw();
   }
 
-  /** Draws the frame of a panel: its name, the meaning of its colours, and a ring around the node under the mouse. */
+  /** Draws the frame of a panel: its name, how many nodes it does not show, the meaning of its colours, and a ring around the node under the mouse. */
   #frameOf(panel) {
     const element = document.createElement("section");
     element.className = "panel";
     const { x, y, width, height } = panel.box;
     Object.assign(element.style, { left: `${x}px`, top: `${y - TITLE}px`, width: `${width}px`, height: `${height + TITLE + FOOT}px` });
     const add = (tag, name, text = "") => { const e = document.createElement(tag); e.className = name; e.textContent = text; element.append(e); return e; };
-    add("h2", "", panel.name);
+    const title = add("div", "title"), name = document.createElement("h2");
+    panel.note = document.createElement("span");
+    name.textContent = panel.name;
+    title.append(name, panel.note);
     if (panel.by === "material") {
       const legend = add("div", "legend");
       for (const { name, color } of scene.materials) {
@@ -219,6 +222,7 @@ class Viewer {
       this.renderer.panel(k, panel.box, this.camera.view(panel.box), pos, shades, panel.by);
       panel.stopped.hidden = Boolean(pos);
       panel.stopped.textContent = pos ? "" : panel.of.stopped;
+      panel.note.textContent = pos ? panel.of.notes[this.frame] : "";
     });
     $("frame").value = this.frame;
     $("time").textContent = `${(this.frame * scene.frameInterval).toFixed(scene.decimals)} s   frame ${this.frame * scene.stride}`;

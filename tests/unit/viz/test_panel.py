@@ -12,6 +12,7 @@ from gpe_pl.viz.camera import Camera
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.film_strip import new_figure
 from gpe_pl.viz.panel import HIDDEN, Panel, drawn_faces, outline
+from tests.open_scenes import open_trajectory
 
 
 class Diamond:
@@ -60,6 +61,21 @@ def test_a_panel_says_how_many_nodes_it_does_not_show(ground_truth):
     assert panel_of(ground_truth).note.get_text() == ""
     gone = replace(ground_truth, pos=ground_truth.pos + np.where(np.arange(ground_truth.num_nodes)[:, None] < 3, -5.0, 0.0))
     assert panel_of(gone).note.get_text() == f"3 of {ground_truth.num_nodes} nodes\nare outside"
+    pos = gone.pos.copy()
+    pos[:, 3:5] = np.nan
+    assert panel_of(replace(gone, pos=pos)).note.get_text().endswith(f"2 of {ground_truth.num_nodes} nodes\nare missing")
+
+
+def test_nodes_that_are_not_in_an_open_scene_are_not_missing():
+    scene = open_trajectory().with_absent_hidden()
+    assert scene.alive is not None
+    frame = scene.num_frames // 2
+    present = np.flatnonzero(scene.alive[frame])
+    assert 2 < len(present) < scene.num_nodes
+    assert panel_of(scene, frame).note.get_text() == ""
+    pos = scene.pos.copy()
+    pos[frame, present[:2]] = np.nan
+    assert panel_of(replace(scene, pos=pos), frame).note.get_text() == f"2 of {len(present)} nodes\nare missing"
 
 
 def test_mesh_cells_are_filled_and_only_loose_particles_are_dots(mesh, dim):

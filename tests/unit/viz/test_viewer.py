@@ -12,6 +12,7 @@ from gpe_pl.export.trajectories import write_vtk
 from gpe_pl.trajectory.state import Stress
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.viewer import FASTEST, ViewerError, write_viewer
+from tests.open_scenes import open_trajectory
 
 
 class Page:
@@ -88,8 +89,28 @@ def test_what_exploded_is_left_out_and_takes_no_precision(tmp_path, ground_truth
     missing = np.isnan(shown).all(axis=-1)
     assert missing[5, 0] and missing[6, 1] and missing.sum() == 2
     assert rounding < 1e-5 and page.scene["steps"]["speed"] <= FASTEST * vel.shape[-1] / 65534
-    rmse = page.scene["trajectories"][1]["rmse"]
-    assert rmse[4] == 0.0 and rmse[5] is None
+    about, count = page.scene["trajectories"][1], ground_truth.num_nodes
+    assert about["rmse"][4] == about["rmse"][5] == 0.0
+    assert about["notes"][4:7] == ["", f"1 of {count} nodes are missing", f"1 of {count} nodes are outside"]
+    assert not any(page.scene["trajectories"][0]["notes"])
+
+
+def test_the_error_is_that_of_the_nodes_that_have_a_position(tmp_path, ground_truth, prediction):
+    pos = prediction.pos.copy()
+    pos[7:, ::2] = np.nan
+    pos[9:] = np.nan
+    write_viewer(tmp_path / "a.html", ground_truth, {"GPE": replace(prediction, pos=pos)})
+    rmse = Page(tmp_path / "a.html").scene["trajectories"][1]["rmse"]
+    assert rmse[7] == pytest.approx(np.sqrt(((pos[7, 1::2] - ground_truth.pos[7, 1::2]) ** 2).sum(-1).mean()))
+    assert rmse[9:] == [None] * (len(pos) - 9)
+
+
+def test_nodes_that_are_not_in_an_open_scene_are_not_missing(tmp_path):
+    scene = open_trajectory()
+    assert scene.alive is not None
+    write_viewer(tmp_path / "a.html", scene, {"GPE": scene.frames(0, 10)})
+    assert not any(any(trajectory["notes"]) for trajectory in Page(tmp_path / "a.html").scene["trajectories"])
+    assert not scene.alive[9].all()
 
 
 def test_error_curve_is_the_root_mean_square(tmp_path, ground_truth, stopped):
