@@ -1,7 +1,7 @@
 """Animations of a rollout beside the ground truth: GIF, or MP4 if imageio-ffmpeg is installed."""
 
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -17,13 +17,19 @@ from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
 from gpe_pl.viz.captions import in_common, pictured
 from gpe_pl.viz.coloring import COLOR_MAPS, REFERENCE, ColorBy, Coloring
-from gpe_pl.viz.panel import Panel
+from gpe_pl.viz.film_strip import evenly_spaced_frames
+from gpe_pl.viz.panel import HAZE, Panel
 from gpe_pl.viz.scenery import INK
 
 PANEL_PIXELS, FILM_PIXELS = 360, 960
 CHARACTER_PIXELS = 7
 """Approximate width of a character of the line that names materials, in pixels."""
 DPI = 100
+
+SAMPLES = 8
+"""Number of frames whose colours determine the palette of a GIF."""
+BYTES = np.array([1 << 16, 1 << 8, 1])
+"""Factors that pack red, green and blue into one integer."""
 
 
 class FilmError(GpeError):
@@ -82,14 +88,16 @@ def _write(
     if len(frames) == 0 or fps <= 0:
         raise ValueError(f"{path}: stride and fps must be positive, and there must be a frame to show")
     with replacing(path) as part:
-        images = _images(rows, frames, Coloring(color, list(rows.values()), frames, truth), panel_pixels)
+        coloring = Coloring(color, list(rows.values()), frames, truth)
+        images = _images(rows, frames, coloring, panel_pixels)
         if path.suffix == ".gif":
-            _write_gif(part, images, fps, _palette(color))
+            samples = [frames[k] for k in evenly_spaced_frames(len(frames), SAMPLES)]
+            _write_gif(part, images, fps, _palette(_images(rows, samples, coloring, panel_pixels), color))
         else:
             _write_mp4(part, images, fps, path)
 
 
-def _images(rows: dict[str, Trajectory], frames: range, coloring: Coloring, panel_pixels: int) -> Iterator[np.ndarray]:
+def _images(rows: dict[str, Trajectory], frames: Sequence[int], coloring: Coloring, panel_pixels: int) -> Iterator[np.ndarray]:
     """Yield RGB images [height, width, 3], one per shown frame. Boundaries and titles are drawn once and restored below the particles."""
     first = next(iter(rows.values()))
     aspect = Camera(first).aspect
@@ -127,17 +135,27 @@ def _images(rows: dict[str, Trajectory], frames: range, coloring: Coloring, pane
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _palette(color: ColorBy) -> Image.Image:
-    """Return the 256 colours of a GIF: greys, and the colours of particles. These are pure, mixed with white as at their edges, and darkened as on mesh edges.
+def _palette(images: Iterable[np.ndarray], color: ColorBy) -> Image.Image:
+    """Return the 256 colours of a GIF: paper, and the 255 that represent the colours of these images and of the scale of ``color`` best.
 
-    The palette is fixed, because a palette of the first frame lacks later colours, and one palette per frame flickers.
+    The palette is fixed, because one palette per frame flickers. The images are a few of the film. Other frames may have further colours of the scale, also
+    paler ones of far nodes.
     """
-    hues = np.concatenate([COLOR_MAPS[color](np.linspace(0, 1, 50))[:, :3], [to_rgb(REFERENCE)]])
-    mixed = [*(1 - part * (1 - hues) for part in (1.0, 0.65, 0.3)), 0.75 * hues]
-    # Pillow finds nearest colours approximately: the palette has no colour next to white, so that paper stays white.
-    greys = np.append(np.linspace(0, 0.9, 255 - 4 * len(hues)), 1.0)[:, None].repeat(3, axis=1)
+    packed = np.concatenate([np.unique(image.reshape(-1, 3) @ BYTES, return_counts=True) for image in images], axis=1)
+    values, which = np.unique(packed[0], return_inverse=True)
+    drawn = np.stack([values >> 16, values >> 8 & 255, values & 255], axis=-1)
+    # Rare colours count, too: weigh each by the root of its number of pixels.
+    weight = np.sqrt(np.bincount(which, packed[1])).round().astype(int)
+    # Pillow finds nearest colours only approximately: without colours next to white, paper stays white.
+    is_paper = drawn.min(axis=1) > 246
+    drawn = drawn[~is_paper].repeat(weight[~is_paper], axis=0)
+    hues = np.concatenate([COLOR_MAPS[color](np.linspace(0, 1, 64))[:, :3], [to_rgb(REFERENCE)]])
+    scale = np.concatenate([1 - (1 - white) * (1 - hues) for white in (0, HAZE / 2, HAZE)])
+    scale = np.round(255 * scale).repeat(1 + len(drawn) // (5 * len(scale)), axis=0)
+    pixels = np.concatenate([drawn, scale]).astype(np.uint8)
+    best = Image.fromarray(pixels[None]).quantize(255, Image.Quantize.MEDIANCUT, kmeans=1).getpalette() or []
     image = Image.new("P", (1, 1))
-    image.putpalette(np.round(255 * np.concatenate([*mixed, greys])).astype(np.uint8).tobytes())
+    image.putpalette(bytes(best[: 3 * 255]).ljust(3 * 256, b"\xff"))
     return image
 
 

@@ -1,10 +1,13 @@
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from PIL import Image
 
-from gpe_pl.viz.video import FilmError, write_animation
+from gpe_pl.viz.coloring import REFERENCE, Coloring
+from gpe_pl.viz.video import PANEL_PIXELS, FilmError, _images, write_animation
 
 
 def frames_of(path) -> list[np.ndarray]:
@@ -39,9 +42,27 @@ def test_gif_has_every_frame_and_particles_fall_in_both_panels(tmp_path, ground_
 def test_moved_particles_leave_no_trace(tmp_path, ground_truth):
     write_animation(tmp_path / "a.gif", ground_truth, {})
     write_animation(tmp_path / "b.gif", ground_truth, {}, stride=ground_truth.num_frames - 1)
-    last = frames_of(tmp_path / "a.gif")[-1]
-    assert (last == frames_of(tmp_path / "b.gif")[-1]).all()
+    last, alone = (frames_of(tmp_path / f"{name}.gif")[-1] for name in "ab")
+    assert (((last == 255) == (alone == 255)).all(axis=-1)).all() and np.abs(last - alone).max() < 60  # each film has its palette
     assert tuple(last[40, 20]) == (255, 255, 255) or tuple(last[-3, 3]) == (255, 255, 255)
+
+
+@pytest.mark.parametrize("color", ["height", "speed"])
+def test_colours_of_a_gif_are_those_of_its_scale(tmp_path, ground_truth, color):
+    """Far nodes are paler and edges darker than the scale; none may look like what has no value."""
+    vel = np.gradient(ground_truth.pos, axis=0) + 0.1 * np.random.default_rng(0).normal(size=ground_truth.pos.shape)
+    moving = replace(ground_truth, vel=vel)
+    write_animation(tmp_path / "a.gif", moving, {}, color=color)
+    frames = range(moving.num_frames)
+    drawn = _images({"ground truth": moving}, frames, Coloring(color, [moving], frames), PANEL_PIXELS)
+    neutral = 255 * np.array(to_rgb(REFERENCE))
+    for stored, exact in zip(frames_of(tmp_path / "a.gif"), drawn, strict=True):
+        true = exact.astype(int)
+        colored, paper = np.ptp(true, axis=-1) > 35, (true == 255).all(axis=-1)
+        error = np.abs(stored - true).max(axis=-1)
+        assert error[colored].mean() < 6 and (stored[paper] == 255).all() and stored[true.max(axis=-1) < 60].max() < 110
+        looks_neutral = colored & (np.abs(stored - neutral).max(axis=-1) < 4)
+        assert not (looks_neutral & (np.abs(true - neutral).max(axis=-1) > 12)).any()
 
 
 def test_stride_skips_frames_and_errors_have_colours(tmp_path, ground_truth, prediction):
