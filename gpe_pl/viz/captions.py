@@ -60,6 +60,17 @@ def hidden_nodes(trajectory: Trajectory, frame: int) -> list[str]:
     return [f"{mask.sum()} of {len(pos)} nodes are {what}" for mask, what in ((outside, "outside"), (missing, "missing")) if mask.any()]
 
 
+def time_decimals(frame_dt: float) -> int:
+    """Return the number of decimals that times of frames need: those of the time between frames [s], of which up to six significant digits count."""
+    digits, exponent = f"{frame_dt:.5e}".split("e")
+    return max(0, len(digits.rstrip("0").partition(".")[2]) - int(exponent))
+
+
+def frame_time(frame: int, frame_dt: float) -> str:
+    """Return the time of a frame with as many decimals as the time between frames [s]: ``0.096 s``."""
+    return f"{frame * frame_dt:.{time_decimals(frame_dt)}f} s"
+
+
 def parameter_name(parameter: MaterialParameter) -> str:
     """Return the name of a material parameter in words."""
     return parameter.name.replace("_", " ").replace("youngs", "Young’s").replace("poisson", "Poisson’s")

@@ -13,7 +13,7 @@ from matplotlib.ticker import EngFormatter
 
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
-from gpe_pl.viz.captions import in_common
+from gpe_pl.viz.captions import frame_time, in_common
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.panel import Panel
 from gpe_pl.viz.scenery import INK
@@ -88,8 +88,9 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
             Panel(figure, rectangle(i, j), trajectory, coloring).show_frame(frame)
         x, y, _, h = rectangle(i, 0)
         figure.text(left / 2 / TEXT_WIDTH, y + h / 2, label, rotation=90, va="center", linespacing=1.1, **style)
-    for j, text in enumerate(_times(frames, trajectories[0].metadata.frame_dt)):
+    for j, frame in enumerate(frames):
         x, y, w, h = rectangle(0, j)
+        text = ("" if j else "$t$ = ") + frame_time(frame, trajectories[0].metadata.frame_dt)
         figure.text(x + w / 2, y + h + 0.05 / height, text, va="bottom", **style)
     figure.text(0.5, below / height, caption, va="bottom", linespacing=1.1, **style)
     if has_bar:
@@ -108,13 +109,6 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
             handletextpad=0.1,
         )
     return figure
-
-
-def _times(frames: Sequence[int], frame_dt: float) -> list[str]:
-    """Format times with enough decimals to tell them apart."""
-    times = [frame * frame_dt for frame in frames]
-    decimals = next((d for d in range(2, 6) if len({f"{t:.{d}f}" for t in times}) == len(times)), 6)
-    return [("$t$ = " if k == 0 else "") + f"{time:.{decimals}f} s" for k, time in enumerate(times)]
 
 
 def _draw_bar(figure: Figure, coloring: Coloring, rectangle: tuple[float, float, float, float]) -> None:

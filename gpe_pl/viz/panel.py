@@ -11,7 +11,7 @@ from gpe_pl.schema import CELL_KINDS
 from gpe_pl.trajectory.cells import kinds_of, stacked
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
-from gpe_pl.viz.captions import hidden_nodes
+from gpe_pl.viz.captions import frame_time, hidden_nodes
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.scenery import INK, LIGHT, draw_scenery
 
@@ -149,7 +149,7 @@ class Panel:
         if stop is None:
             self.note.set_text("not simulated")
         else:
-            self.note.set_text(f"stopped at {stop.frame * self.trajectory.metadata.frame_dt:.2f} s\n({stop.reason})")
+            self.note.set_text(f"stopped at {frame_time(stop.frame, self.trajectory.metadata.frame_dt)}\n({stop.reason})")
 
     def _show(
         self, pos: Float[np.ndarray, "node dim"], node_colors: Float[np.ndarray, "node 4"], cell_colors: Float[np.ndarray, "cell 4"]

@@ -15,7 +15,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replacing
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
-from gpe_pl.viz.captions import in_common, pictured
+from gpe_pl.viz.captions import frame_time, in_common, pictured
 from gpe_pl.viz.coloring import COLOR_MAPS, REFERENCE, ColorBy, Coloring
 from gpe_pl.viz.film_strip import evenly_spaced_frames
 from gpe_pl.viz.panel import HAZE, Panel
@@ -129,7 +129,7 @@ def _images(rows: dict[str, Trajectory], frames: Sequence[int], coloring: Colori
         canvas.restore_region(background)
         for panel in panels:
             panel.show_frame(frame)
-        clock.set_text(f"{frame * first.metadata.frame_dt:.2f} s")
+        clock.set_text(frame_time(frame, first.metadata.frame_dt))
         for artist in moving:
             figure.draw_artist(artist)
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()

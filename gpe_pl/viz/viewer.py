@@ -30,7 +30,7 @@ from gpe_pl.geometry.shapes import Bowl, signed_distance
 from gpe_pl.schema import BOUNDARY, NODE_TYPES, node_code
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import AZIMUTH, ELEVATION, vertical_axis
-from gpe_pl.viz.captions import describe, heading, hidden_nodes, pictured, with_heading
+from gpe_pl.viz.captions import describe, frame_time, heading, hidden_nodes, pictured, time_decimals, with_heading
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error
 from gpe_pl.viz.contact_sheet import informative_color
 from gpe_pl.viz.panel import DOT, drawn_faces, outline, polygon_edges
@@ -144,7 +144,7 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
         "nodes": truth.num_nodes,
         "stride": stride,
         "frameInterval": stride * about.frame_dt,
-        "decimals": max(2, int(np.ceil(-np.log10(stride * about.frame_dt)))),
+        "decimals": time_decimals(about.frame_dt),
         "spacing": about.spacing,
         "diameter": DOT * about.spacing,
         "periods": [high - low if periodic else 0.0 for (low, high), periodic in zip(about.bounds, about.periodic, strict=True)],
@@ -179,7 +179,7 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
                 "frames": len(kept),
                 "fields": [*fields],
                 "notes": [", ".join(hidden_nodes(trajectory, frame)) for frame in kept],
-                "stopped": "not simulated" if stop is None else f"stopped at {stop.frame * about.frame_dt:.2f} s ({stop.reason})",
+                "stopped": "not simulated" if stop is None else f"stopped at {frame_time(stop.frame, about.frame_dt)} ({stop.reason})",
                 "rmse": None if number == 0 else _rmse(trajectory, shown[first], frames),
             }
         )

@@ -24,7 +24,7 @@ from gpe_pl.schema import MATERIALS
 from gpe_pl.solvers.scenes import describe
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
-from gpe_pl.viz.captions import parameter_name, parameter_value
+from gpe_pl.viz.captions import frame_time, parameter_name, parameter_value
 
 FASTER = 5.0
 """A rollout stops at this multiple of the solver's largest speed, or of 1 m/s if the solver is slower."""
@@ -255,8 +255,8 @@ def shown(candidate: Candidate, trials: Sequence[Trial], *fractions: float) -> l
     for trial in trials:
         for fraction in fractions:
             frame = round(fraction * (trial.truth.num_frames - 1))
-            time = frame * trial.truth.metadata.frame_dt
-            columns.append(Shown(f"{candidate.described(trial.value)}\n{time:.2f} s", trial.truth, trial.model, frame))
+            time = frame_time(frame, trial.truth.metadata.frame_dt)
+            columns.append(Shown(f"{candidate.described(trial.value)}\n{time}", trial.truth, trial.model, frame))
     return columns
 
 

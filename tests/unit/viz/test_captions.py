@@ -18,7 +18,7 @@ from gpe_pl.trajectory.store import read_trajectory, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz import contact_sheet as sheets
 from gpe_pl.viz import video
-from gpe_pl.viz.captions import describe, parameter_value, row_label
+from gpe_pl.viz.captions import describe, frame_time, parameter_value, row_label
 from gpe_pl.viz.contact_sheet import contact_sheet
 from gpe_pl.viz.figures import rollout_figure
 from gpe_pl.viz.video import write_animation, write_film
@@ -146,3 +146,19 @@ def test_a_stored_prediction_stays_one(tmp_path: Path) -> None:
 def test_a_distance_between_predictions_is_no_error() -> None:
     bars = [rollout_figure(first, {"other": predicted()}, color="error").axes[-1].get_ylabel() for first in (truth(), predicted())]
     assert bars == ["position error [m]", "distance from the first row [m]"]
+
+
+@pytest.mark.parametrize(
+    ("frame", "frame_dt", "expected"),
+    [
+        (48, 0.002, "0.096 s"),
+        (7, 2.5e-3, "0.0175 s"),
+        (7, float(np.float32(2.5e-3)), "0.0175 s"),  # as stored
+        (11, 0.02, "0.22 s"),
+        (5, 0.1, "0.5 s"),
+        (3, 40.0, "120 s"),
+        (59, 1 / 60, "0.9833333 s"),
+    ],
+)
+def test_times_are_as_exact_as_the_time_between_frames(frame, frame_dt, expected):
+    assert frame_time(frame, frame_dt) == expected

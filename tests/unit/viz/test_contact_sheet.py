@@ -88,6 +88,7 @@ def test_a_row_that_stopped_says_so(ground_truth):
 def test_short_times_are_told_apart(ground_truth):
     quick = replace(ground_truth, metadata=replace(ground_truth.metadata, frame_dt=1e-3))
     assert texts(contact_sheet({"a": quick}, num_columns=12))[1:4] == ["$t$ = 0.000 s", "0.001 s", "0.002 s"]
+    assert texts(contact_sheet({"a": quick}, num_columns=3))[1:4] == ["$t$ = 0.000 s", "0.006 s", "0.011 s"]  # not rounded
 
 
 def test_a_sheet_is_saved_at_its_own_resolution(tmp_path, ground_truth):

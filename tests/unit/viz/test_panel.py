@@ -8,6 +8,7 @@ from matplotlib.colors import to_rgba
 
 from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Sphere, domain_walls
 from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.trajectory import Termination
 from gpe_pl.viz.camera import Camera
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.film_strip import new_figure
@@ -64,6 +65,12 @@ def test_a_panel_says_how_many_nodes_it_does_not_show(ground_truth):
     pos = gone.pos.copy()
     pos[:, 3:5] = np.nan
     assert panel_of(replace(gone, pos=pos)).note.get_text().endswith(f"2 of {ground_truth.num_nodes} nodes\nare missing")
+
+
+def test_a_panel_says_exactly_when_a_rollout_stopped(ground_truth):
+    metadata = replace(ground_truth.metadata, frame_dt=2.5e-3)
+    stopped = replace(ground_truth.frames(0, 7), metadata=metadata, termination=Termination("explosion", 7, 0, ""))
+    assert panel_of(stopped, 9).note.get_text() == "stopped at 0.0175 s\n(explosion)"
 
 
 def test_nodes_that_are_not_in_an_open_scene_are_not_missing():

@@ -39,6 +39,13 @@ def test_gif_has_every_frame_and_particles_fall_in_both_panels(tmp_path, ground_
         assert image.info["duration"] == 50 and image.info["loop"] == 0
 
 
+def test_the_clock_tells_short_frames_apart(tmp_path, ground_truth):
+    """Where nothing moves, equal frames become one."""
+    still = replace(ground_truth, pos=ground_truth.pos[:1].repeat(5, axis=0), vel=0 * ground_truth.vel[:5])
+    write_animation(tmp_path / "a.gif", replace(still, metadata=replace(still.metadata, frame_dt=2e-3)), {})
+    assert len(frames_of(tmp_path / "a.gif")) == 5
+
+
 def test_moved_particles_leave_no_trace(tmp_path, ground_truth):
     write_animation(tmp_path / "a.gif", ground_truth, {})
     write_animation(tmp_path / "b.gif", ground_truth, {}, stride=ground_truth.num_frames - 1)

@@ -121,6 +121,14 @@ def test_error_curve_is_the_root_mean_square(tmp_path, ground_truth, stopped):
     assert about["frames"] == 3 and about["stopped"] == "stopped at 0.14 s (explosion)"
 
 
+def test_times_have_the_decimals_of_the_frames(tmp_path, ground_truth, stopped):
+    quick, short = (replace(t, metadata=replace(t.metadata, frame_dt=2.5e-3)) for t in (ground_truth, stopped))
+    for stride in (1, 4):
+        write_viewer(tmp_path / "a.html", quick, {"GPE": short}, stride)
+        scene = Page(tmp_path / "a.html").scene
+        assert scene["decimals"] == 4 and scene["trajectories"][1]["stopped"] == "stopped at 0.0175 s (explosion)"
+
+
 def test_names_cannot_break_out_of_the_page(tmp_path, ground_truth, prediction):
     write_viewer(tmp_path / "a.html", ground_truth, {"</script><b>": prediction}, title="<i>&")
     page = Page(tmp_path / "a.html")
