@@ -24,6 +24,11 @@ TEXT_WIDTH = 7.0
 LINE, CHARACTER = 0.14, 0.062
 """Height of a line and approximate width of a character of a row's label [inch]."""
 
+LOWEST_ROW, LOWEST_BAR = 0.5, 0.8
+"""Least heights of a row, also of a flat scene, and of a colour bar [inch]."""
+BAR_MARGIN, BAR_CHARACTER = 0.3, 0.054
+"""Height by which the label of a colour bar may exceed the bar, and approximate width of a character of this label [inch]."""
+
 
 def new_figure(width: float, height: float, dpi: int = 150) -> Figure:
     """Return an empty figure of this width and height [inch], with its own canvas and unknown to pyplot."""
@@ -45,6 +50,8 @@ def evenly_spaced_frames(num_frames: int, num_columns: int) -> list[int]:
 
 def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], coloring: Coloring, dpi: int = 150) -> Figure:
     """Draw a panel per trajectory and frame, times above the columns, materials and the meaning of colours below, and a colour bar or legend.
+
+    Rows of a flat scene are higher than its panels, so that labels and notes have room.
 
     Args:
         rows: label and trajectory of each row, from top to bottom, of scenes in the same domain.
@@ -69,33 +76,41 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
     def panel_width(left: float) -> float:
         return (TEXT_WIDTH - left - right - gap * (len(frames) - 1)) / len(frames)
 
-    wrap_at = max(1, int(panel_width(0.5) * aspect / CHARACTER))
+    wrap_at = int(max(LOWEST_ROW, panel_width(0.5) * aspect) / CHARACTER)
     labels = [
         "\n".join(part for line in label.split("\n") for part in textwrap.wrap(line, wrap_at, break_long_words=False)) for label, _ in rows
     ]
     left = 0.06 + LINE * max(label.count("\n") + 1 for label in labels)
+    longest = max(len(line) for label in labels for line in label.split("\n"))
+    lowest = max(LOWEST_ROW, longest * CHARACTER, LOWEST_BAR / len(rows) if has_bar else 0.0)
+    bar_height = max(LOWEST_BAR, (len(rows) - first_with_bar) * max(lowest, panel_width(left) * aspect))
+    bar_label = textwrap.fill(coloring.bar_label or "", int((bar_height + BAR_MARGIN) / BAR_CHARACTER))
+    right += LINE * bar_label.count("\n")
     width = panel_width(left)
-    height = top + len(rows) * (width * aspect + gap) + bottom
+    row_height = max(lowest, width * aspect)
+    above = (row_height - width * aspect) / 2
+    height = top + len(rows) * (row_height + gap) + bottom
     figure = new_figure(TEXT_WIDTH, height, dpi)
 
     def rectangle(row: int, column: int) -> tuple[float, float, float, float]:
-        x, y = left + column * (width + gap), height - top - (row + 1) * width * aspect - row * gap
+        x, y = left + column * (width + gap), height - top - (row + 1) * row_height - row * gap + above
         return x / TEXT_WIDTH, y / height, width / TEXT_WIDTH, width * aspect / height
 
     style: dict[str, Any] = {"fontsize": 8, "color": INK, "ha": "center"}
     for i, (label, trajectory) in enumerate(zip(labels, trajectories, strict=True)):
         for j, frame in enumerate(frames):
-            Panel(figure, rectangle(i, j), trajectory, coloring).show_frame(frame)
+            Panel(figure, rectangle(i, j), trajectory, coloring, above).show_frame(frame)
         x, y, _, h = rectangle(i, 0)
         figure.text(left / 2 / TEXT_WIDTH, y + h / 2, label, rotation=90, va="center", linespacing=1.1, **style)
     for j, frame in enumerate(frames):
-        x, y, w, h = rectangle(0, j)
+        x, _, w, _ = rectangle(0, j)
         text = ("" if j else "$t$ = ") + frame_time(frame, trajectories[0].metadata.frame_dt)
-        figure.text(x + w / 2, y + h + 0.05 / height, text, va="bottom", **style)
+        figure.text(x + w / 2, 1 - (top - 0.05) / height, text, va="bottom", **style)
     figure.text(0.5, below / height, caption, va="bottom", linespacing=1.1, **style)
     if has_bar:
-        low, high = rectangle(len(rows) - 1, 0)[1], rectangle(first_with_bar, 0)
-        _draw_bar(figure, coloring, (1 - (right - 0.1) / TEXT_WIDTH, low, 0.08 / TEXT_WIDTH, high[1] + high[3] - low))
+        rows_beside = len(rows) - first_with_bar
+        tall = max(LOWEST_BAR, rows_beside * row_height + (rows_beside - 1) * gap)
+        _draw_bar(figure, coloring, bar_label, (1 - (right - 0.1) / TEXT_WIDTH, (bottom + gap) / height, 0.08 / TEXT_WIDTH, tall / height))
     if legend:
         handles = [Line2D([], [], linestyle="", marker="o", markersize=5, color=color, label=name) for name, color in legend.items()]
         figure.legend(
@@ -111,10 +126,10 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
     return figure
 
 
-def _draw_bar(figure: Figure, coloring: Coloring, rectangle: tuple[float, float, float, float]) -> None:
+def _draw_bar(figure: Figure, coloring: Coloring, label: str, rectangle: tuple[float, float, float, float]) -> None:
     formatter = EngFormatter(unit="Pa") if coloring.by == "von_mises" else None
     axes = figure.add_axes(rectangle)
     bar = figure.colorbar(ScalarMappable(coloring.scale, coloring.color_map), cax=axes, extend="max", format=formatter)
-    bar.set_label(coloring.bar_label, fontsize=7, color=INK)
+    bar.set_label(label, fontsize=7, color=INK)
     bar.ax.tick_params(labelsize=6.5, width=0.5, length=2)
     bar.outline.set_linewidth(0.5)

@@ -29,6 +29,9 @@ MAX_FACES = 30_000
 HAZE, HIDDEN = 0.3, 0.25
 """Fraction of white at the far end of a 3D scene, and opacity of items behind an obstacle."""
 
+NOTE, NOTE_PAD, NOTE_WIDTH = 7, 4.0, 0.92
+"""Largest size of a note's letters and its distance from the top of the panel [points], and its largest width as a fraction of the panel's."""
+
 FACES = {
     "tetrahedron": np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]),
     "wedge": np.array([[0, 1, 2, 2], [3, 5, 4, 4], [0, 3, 4, 1], [1, 4, 5, 2], [2, 5, 3, 0]]),
@@ -95,9 +98,12 @@ class Panel:
         rectangle: left, bottom, width and height as fractions of the figure; the aspect ratio must be that of ``Camera``.
         trajectory: trajectory to show.
         coloring: colours of its particles and mesh cells.
+        above: height of the free paper above and below the panel [inch], where notes stand that would cover most of a flat panel.
     """
 
-    def __init__(self, figure: Figure, rectangle: tuple[float, float, float, float], trajectory: Trajectory, coloring: Coloring) -> None:
+    def __init__(
+        self, figure: Figure, rectangle: tuple[float, float, float, float], trajectory: Trajectory, coloring: Coloring, above: float = 0.0
+    ) -> None:
         self.trajectory, self.coloring, self.camera = trajectory, coloring, Camera(trajectory)
         self._is_3d = trajectory.metadata.dim == 3
         self._faces, self._cell_of_face = drawn_faces(trajectory)
@@ -124,8 +130,11 @@ class Panel:
         self._outline = outline(trajectory)
         self.outline: Any = LineCollection([], colors=[INK], linewidths=0.4, capstyle="round", snap=False, zorder=3)
         self.axes.add_collection(self.outline, autolim=False)
-        self.note: Any = self.axes.text(
-            0.5, 0.5, "", transform=self.axes.transAxes, ha="center", va="center", color="0.35", fontsize=7, zorder=5
+        self.note: Any = self.axes.text(0.5, 0.5, "", transform=self.axes.transAxes, ha="center", color="0.35", zorder=5)
+        self._width, self._height, self._above = (
+            72 * rectangle[2] * figure.get_figwidth(),
+            72 * rectangle[3] * figure.get_figheight(),
+            72 * above,
         )
         self.note.set_bbox({"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5})
         self._cover = draw_scenery(self.axes, self.camera, trajectory, points_per_metre)
@@ -140,16 +149,38 @@ class Panel:
         if frame < self.trajectory.num_frames:
             pos = self.trajectory.metadata.periodicity.wrapped(self.trajectory.pos[frame].astype(np.float64))
             self._show(pos, *self.coloring(self.trajectory, frame))
-            self.note.set_text("\n".join(hidden_nodes(self.trajectory, frame)).replace(" are", "\nare"))
-            self.note.set_y(0.85)  # above most of the motion
+            self._note_above_motion("\n".join(hidden_nodes(self.trajectory, frame)))
             return
         self._show(np.full(self.trajectory.pos.shape[1:], np.nan), *self.coloring(self.trajectory, 0))
-        self.note.set_y(0.5)
         stop = self.trajectory.termination
-        if stop is None:
-            self.note.set_text("not simulated")
+        reason = (
+            "not simulated" if stop is None else f"stopped at {frame_time(stop.frame, self.trajectory.metadata.frame_dt)}\n({stop.reason})"
+        )
+        if self._fit(reason) > self._height + 2 * self._above:
+            self._fit(reason.replace("\n", " "))
+        self.note.set(y=0.5, va="center")
+
+    def _fit(self, text: str) -> float:
+        """Write a note that is no wider than the panel; return its height [points]."""
+        self.note.set_text(text)
+        self.note.set_fontsize(NOTE)
+        if not text:
+            return 0.0
+        points = 72 / self.note.figure.dpi
+        self.note.set_fontsize(NOTE * min(1.0, NOTE_WIDTH * self._width / (points * self.note.get_window_extent().width)))
+        return float(points * self.note.get_window_extent().height)
+
+    def _note_above_motion(self, text: str) -> None:
+        """Write a note at the top of the panel, or above it if it would cover half of the panel and there is room."""
+        height = self._fit(text.replace(" are", "\nare"))
+        if height > self._height / 2:
+            height = self._fit(text)
+        if self._height / 2 < height <= self._above:
+            self.note.set(y=1.0, va="bottom")
+        elif height + NOTE_PAD <= self._height:
+            self.note.set(y=1 - NOTE_PAD / self._height, va="top")
         else:
-            self.note.set_text(f"stopped at {frame_time(stop.frame, self.trajectory.metadata.frame_dt)}\n({stop.reason})")
+            self.note.set(y=0.5, va="center")
 
     def _show(
         self, pos: Float[np.ndarray, "node dim"], node_colors: Float[np.ndarray, "node 4"], cell_colors: Float[np.ndarray, "cell 4"]

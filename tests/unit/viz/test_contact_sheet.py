@@ -1,12 +1,16 @@
 from dataclasses import replace
+from itertools import combinations
 
+import numpy as np
 import pytest
 
 from gpe_pl.schema import node_code
 from gpe_pl.trajectory.trajectory import Termination
+from gpe_pl.viz.coloring import ColorBy
 from gpe_pl.viz.contact_sheet import contact_sheet
-from gpe_pl.viz.figures import parameter_strip
+from gpe_pl.viz.figures import parameter_strip, rollout_figure
 from tests.open_scenes import open_trajectory
+from tests.unit.viz.conftest import falling
 
 
 def texts(figure) -> list[str]:
@@ -51,6 +55,64 @@ def test_rows_that_are_low_break_their_labels(ground_truth, dim):
     label = next(t for t in figure.texts if t.get_text().startswith("hardening"))
     box, first = label.get_window_extent(), figure.axes[0].get_window_extent()
     assert box.x0 >= 0 and box.x1 <= first.x0
+
+
+FLAT = ((0.0, 3.0), (0.0, 0.3))
+
+
+def flat_figure(rows: list[str], color: ColorBy = "error"):
+    """Return a figure of a channel of 3 m × 0.3 m whose last row has nodes above it and nodes without a position, and with a row that stopped."""
+    base = falling(2)
+    base = replace(base, metadata=replace(base.metadata, bounds=FLAT), vel=np.ones_like(base.pos))
+    truth = replace(base, pos=0.3 * base.pos)
+    pos = truth.pos.copy()
+    pos[5:, :5, 1], pos[5:, 5:7] = 1.0, np.nan
+    short = replace(truth.frames(0, 5), termination=Termination("explosion", 5, 0, ""))
+    figure = rollout_figure(truth, dict.fromkeys(rows, short) | {"last": replace(truth, pos=pos)}, color=color)
+    figure.canvas.draw()
+    return figure
+
+
+def are_apart(boxes) -> bool:
+    return all(a.x1 <= b.x0 or b.x1 <= a.x0 or a.y1 <= b.y0 or b.y1 <= a.y0 for a, b in combinations(boxes, 2))
+
+
+@pytest.mark.parametrize("rows", [[], ["second"], ["one", "two", "a longer name"]])
+def test_labels_and_notes_of_flat_scenes_have_room(rows):
+    figure = flat_figure(rows)
+    labels = [text.get_window_extent() for text in figure.texts if text.get_rotation() == 90]
+    notes = [axes.texts[0].get_window_extent() for axes in figure.axes[:-1] if axes.texts[0].get_text()]
+    assert len(labels) == len(rows) + 2 and len(notes) == 3 * len(rows) + 3
+    assert are_apart([*labels, *notes, *(text.get_window_extent() for text in figure.texts if text.get_rotation() == 0)])
+    assert all(figure.bbox.x0 <= box.x0 and box.y1 <= figure.bbox.y1 and box.y0 >= figure.bbox.y0 for box in labels)
+    for axes in figure.axes[-7:-1]:  # notes about nodes do not hide a low panel
+        note = axes.texts[0].get_window_extent()
+        assert not axes.texts[0].get_text() or note.y0 >= axes.bbox.y1 - 1
+
+
+@pytest.mark.parametrize("is_prediction", [False, True])
+def test_the_colour_bar_of_a_flat_scene_can_be_read(is_prediction):
+    flat = falling(2)
+    flat = replace(flat, metadata=replace(flat.metadata, bounds=FLAT), vel=np.ones_like(flat.pos), is_prediction=is_prediction)
+    for figure in (rollout_figure(flat, {"GPE": flat}), rollout_figure(flat, {}, color="speed")):
+        figure.canvas.draw()
+        bar = figure.axes[-1]
+        assert bar.bbox.height > 0.75 * figure.dpi  # without its tip
+        ticks = [t.get_window_extent() for t in bar.get_yticklabels() if bar.get_ylim()[0] <= t.get_position()[1] <= bar.get_ylim()[1]]
+        assert len(ticks) > 1 and are_apart(ticks)
+        label, whole = bar.yaxis.label.get_window_extent(), figure.bbox
+        assert whole.y0 <= label.y0 and label.y1 <= whole.y1 and label.x1 <= whole.x1
+
+
+def test_notes_stay_within_their_panel(ground_truth):
+    pos = ground_truth.pos.copy()
+    pos[5:, :5, -1], pos[5:, 5:7] = 3.0, np.nan
+    figure = rollout_figure(ground_truth, {"GPE": replace(ground_truth, pos=pos)})
+    figure.canvas.draw()
+    for axes in figure.axes[:-1]:
+        note, panel = axes.texts[0].get_window_extent(), axes.bbox
+        assert not axes.texts[0].get_text() or (panel.x0 <= note.x0 and note.x1 <= panel.x1 and panel.y0 <= note.y0 and note.y1 <= panel.y1)
+    assert sum(bool(axes.texts[0].get_text()) for axes in figure.axes[:-1]) == 3
 
 
 def test_stress_has_a_colour_bar_in_engineering_units(mesh):
