@@ -140,7 +140,15 @@ class FitRun:
 
     def claim_folder(self) -> None:
         """Assign the folder to this run; raises ``RunError`` if it belongs to a run with another configuration."""
-        claim(self.folder, self._config)
+        try:
+            claim(self.folder, self._config)
+        except RunError as error:
+            if self.cfg.training.budget_minutes is None or "training.num_steps" not in str(error):
+                raise
+            raise RunError(
+                f"{error}. training.num_steps follows from training.budget_minutes and the measured time of a step, which trainer.accelerator and "
+                "trainer.matmul_precision change"
+            ) from None
 
     @property
     def is_evaluated(self) -> bool:

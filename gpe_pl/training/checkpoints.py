@@ -18,6 +18,7 @@ from lightning.fabric.plugins.io import TorchCheckpointIO
 from lightning.pytorch.callbacks import Checkpoint
 
 from gpe_pl.errors import GpeError
+from gpe_pl.errors.origin import came_through
 from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.learned.checkpoint_file import CheckpointError, load_checkpoint, reason
 from gpe_pl.system import ranks
@@ -26,6 +27,8 @@ from gpe_pl.training.interruption import Interruption
 
 log = logging.getLogger(__name__)
 
+RESTORING = "lightning.pytorch.trainer.connectors.checkpoint_connector"
+"""Module of Lightning that restores checkpoints."""
 NUM_STANDARD_ERRORS = 2.0
 """How far above the lowest mean error a validation has to be, in standard errors, to be clearly worse."""
 
@@ -133,11 +136,12 @@ class Checkpoints(Checkpoint):
 
     @contextmanager
     def taken_up(self) -> Iterator[None]:
-        """Raise ``CheckpointError`` if Lightning fails to restore ``last.ckpt`` inside this context. Errors of later training steps are not converted."""
+        """Raise ``CheckpointError`` if Lightning fails to restore ``last.ckpt`` inside this context. Other errors are not converted."""
         try:
             yield
         except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
-            if self.has_begun or not self.last.exists() or isinstance(error, GpeError | torch.OutOfMemoryError):
+            is_restoring = came_through(error, RESTORING) and not came_through(error, "torch.distributed")
+            if self.has_begun or not is_restoring or isinstance(error, GpeError | torch.OutOfMemoryError):
                 raise
             raise CheckpointError(
                 f"{self.last}: training cannot resume from it ({reason(error)}); delete the file, and the same command trains from the start"

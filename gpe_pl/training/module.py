@@ -20,7 +20,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.data.dataset import Samples
 from gpe_pl.data.training_samples import Unroll, UnrollStart
 from gpe_pl.errors import GpeError
-from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE
 from gpe_pl.models.base import Prediction
 from gpe_pl.nn.stores import predicted_rows
@@ -30,6 +30,7 @@ from gpe_pl.training.cuda_graph import CudaGraphs
 from gpe_pl.training.loss_terms import LEAST_ERROR, Loss, StressLoss, num_neighbors, penalty, stress_error, without_held
 from gpe_pl.training.optimizer import OnePassAdam, clip
 from gpe_pl.training.push_forward import Excursions
+from gpe_pl.training.resumption import check_resumable
 from gpe_pl.training.unroll_gradients import predictions
 
 Schedule = Literal["cosine", "exponential", "staircase"]
@@ -42,14 +43,6 @@ run."""
 
 COMPILE_PAYS_AFTER = 10_000
 """Number of training steps from which compilation saves more time than it takes. ``compile: auto`` compiles longer runs."""
-
-RESUMED = {
-    *("state_dict", "optimizer_states", "lr_schedulers", "loops", "callbacks", "global_step"),
-    *("skipped", "excursions"),
-}
-"""Keys that a checkpoint needs for a run to resume from it."""
-OF_AVERAGE = {"current_model_state", "averaging_state"}
-"""Further keys that a checkpoint needs if the run averages its weights."""
 
 log = logging.getLogger(__name__)
 
@@ -299,17 +292,20 @@ class TrainingModule(L.LightningModule):
         if (self.global_step + 1) % getattr(
             self._trainer, "log_every_n_steps", 1
         ) == 0:  # Lightning takes as long for a value that no logger gets
-            self.log("train/loss", total, batch_size=1)
+            self.log("train/loss", total, batch_size=1, logger=False)
+            for logger in self.loggers:  # Lightning writes only after the step, which an interruption may end
+                logger.log_metrics({"train/loss": float(total)}, step=self.global_step)
         return loss
 
     def configure_gradient_clipping(
         self, optimizer: torch.optim.Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        """Clip the gradient by its norm if a clip value is set. A gradient that is not finite is dropped and leaves the weights unchanged."""
+        """Clip the gradient by its norm if a clip value is set. If the loss or the gradient is not finite, drop the gradient; weights and moments then stay."""
         norm = clip([p for group in optimizer.param_groups for p in group["params"]], gradient_clip_val)
-        if not math.isfinite(norm):
-            if not self._skipped or self._skipped[-1] != self.global_step:  # else its loss was not finite either
-                self._skip("gradient norm", norm)
+        loss_is_finite = not self._skipped or self._skipped[-1] != self.global_step
+        if loss_is_finite and not math.isfinite(norm):
+            self._skip("gradient norm", norm)
+        if not (loss_is_finite and math.isfinite(norm)):
             optimizer.zero_grad(set_to_none=True)  # without gradients Adam changes neither weights nor moments
 
     def _skip(self, name: str, value: float) -> None:
@@ -352,9 +348,7 @@ class TrainingModule(L.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         callbacks = () if self._trainer is None else self._trainer.callbacks  # type: ignore[attr-defined]
         is_averaged = any(isinstance(callback, WeightAveraging) for callback in callbacks)
-        missing = (RESUMED | OF_AVERAGE if is_averaged else RESUMED) - checkpoint.keys()
-        if missing:
-            raise CheckpointError(f"last.ckpt: has no {min(missing)}, which resuming needs; delete the file to train from the start")
+        check_resumable(checkpoint, list(self.simulator.parameters()), is_averaged)
         self._skipped.extend(checkpoint["skipped"])
         self._excursions.load_state_dict(checkpoint["excursions"])
 

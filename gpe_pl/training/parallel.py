@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
+from typing import ClassVar
 
 import torch
 import torch.distributed as dist
@@ -46,9 +47,17 @@ class SummedGradients(DDPStrategy):
     """Lightning's DDP strategy with ``sum_gradients`` instead of its wrapper around the module.
 
     All ranks start from the weights and statistics of rank 0 and then apply the same updates, so their weights stay equal bit for bit.
+
+    Attributes:
+        has_started_processes: whether this process has started others, which run its command from the beginning. For a second training they would begin with
+            the first one.
     """
 
+    has_started_processes: ClassVar[bool] = False
+
     def setup_environment(self) -> None:
+        if getattr(self.launcher, "procs", []):
+            SummedGradients.has_started_processes = True
         super().setup_environment()
         module = self.lightning_module
         assert module is not None
@@ -63,5 +72,9 @@ class SummedGradients(DDPStrategy):
 
     def on_exception(self, exception: BaseException) -> None:
         """End the processes that this one has started, which would otherwise wait for it forever."""
-        for process in getattr(self.launcher, "procs", []):
+        started = getattr(self.launcher, "procs", [])
+        processes = started[:]
+        started.clear()  # Lightning watches this list, and kills the main process, too, when one of these fails
+        for process in processes:
             process.kill()
+            process.wait()

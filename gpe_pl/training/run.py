@@ -24,8 +24,11 @@ from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import PushForward, Sampling
+from gpe_pl.errors import GpeError
+from gpe_pl.errors.origin import came_through
 from gpe_pl.files.atomic import replacing
 from gpe_pl.files.run_folder import CONFIG, RunError, config_in, differences
+from gpe_pl.learned.checkpoint_file import reason
 from gpe_pl.system.machine import keep_freed_memory
 from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints, Checkpoints
@@ -237,7 +240,8 @@ def train(
         Path of the best checkpoint; see ``Checkpoints``.
 
     Raises:
-        RunError: the accelerator or devices are not available, or training was interrupted; the message says how to resume.
+        RunError: the accelerator or devices are not available, training was interrupted, or another process of it has ended; the message says how to
+            resume. Or this process has already trained together with processes that it started.
         TrainingError: losses are not finite; the message names the last checkpoint.
         CheckpointError: training cannot resume from ``last.ckpt``.
     """
@@ -267,17 +271,18 @@ def train(
     except SystemExit:  # Lightning's answer to an interruption
         if trainer.global_rank > 0:
             raise
-        saved = checkpoints.where_saved()
-        advice = (
-            "nothing was saved yet, the same command starts again"
-            if saved is None
-            else f"run the same command again to resume from {saved}"
-        )
-        raise RunError(f"interrupted; {advice}") from None
+        raise RunError(f"interrupted; {_how_to_continue(checkpoints)}") from None
     except TrainingError as error:
         saved = checkpoints.where_saved()
         raise TrainingError(
             f"{error}; {'no checkpoint was saved yet' if saved is None else f'the last good checkpoint is kept: {saved}'}"
+        ) from None
+    except RuntimeError as error:
+        if isinstance(error, GpeError) or not came_through(error, "torch.distributed"):
+            raise
+        raise RunError(
+            f"the connection to the other processes of the training failed ({reason(error)}). If one of them has ended, its message is above; "
+            f"{_how_to_continue(checkpoints)}"
         ) from None
     if checkpoints.best_step == 0:
         log.warning(
@@ -287,6 +292,11 @@ def train(
             checkpoints.last,
         )
     return checkpoints.best
+
+
+def _how_to_continue(checkpoints: Checkpoints) -> str:
+    saved = checkpoints.where_saved()
+    return "nothing was saved yet, the same command starts again" if saved is None else f"run the same command again to resume from {saved}"
 
 
 def _validation(datamodule: TrajectoryDataModule, training: TrainingSettings) -> RolloutValidation:
@@ -316,9 +326,14 @@ def _trainer(
     """Return Lightning's trainer.
 
     Raises:
-        RunError: the accelerator or devices are not available.
+        RunError: the accelerator or devices are not available, or this process has already trained together with processes that it started.
     """
     is_parallel = trainer_settings.num_processes > 1
+    if is_parallel and SummedGradients.has_started_processes:
+        raise RunError(
+            f"trainer.devices={trainer_settings.devices}: this Python process has already trained on several devices; start each such training as a "
+            "command or script of its own"
+        )
     if is_parallel:
         os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # else Lightning divides all cores between the processes
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import os
 import shutil
@@ -92,10 +93,15 @@ def trained(
     at: dict[int, Callable[[], None]] | None = None,
     starts_trained: bool = False,
     warmup_steps: int = 2,
+    at_setup: Callable[[], None] = lambda: None,
 ) -> Path:
-    """Train in a folder, or resume; ``at`` acts before steps."""
+    """Train in a folder, or resume; ``at`` acts before steps, ``at_setup`` before anything is restored."""
 
     class Disturbed(TrainingModule):
+        def setup(self, stage: str) -> None:
+            self.trainer.log_every_n_steps = 1
+            at_setup()
+
         def training_step(self, batch: Any, batch_idx: int) -> torch.Tensor | None:
             (at or {}).get(self.global_step, lambda: None)()
             return super().training_step(batch, batch_idx)
@@ -383,6 +389,23 @@ def test_checkpoints_that_are_links_are_replaced_not_followed(data: Path, tmp_pa
     trained(data, tmp_path / "run")
     assert (tmp_path / "best").read_text() == "of someone else"
     assert not (folder / "best.ckpt").is_symlink()
+
+
+def test_no_loss_is_missing_after_interruptions(data: Path, tmp_path: Path) -> None:
+    for step in (1, 4):
+        with pytest.raises(RunError, match=f"step {step + 1}$"):
+            trained(data, tmp_path / "run", at={step: send(signal.SIGTERM)})
+    trained(data, tmp_path / "run")
+    rows = [row for k in range(3) for row in csv.DictReader((tmp_path / "run" / "log" / f"version_{k}" / "metrics.csv").open())]
+    assert [int(row["step"]) for row in rows if row["train/loss"]] == [*range(STEPS)]
+
+
+def test_an_error_before_anything_is_restored_is_not_blamed_on_the_checkpoint(data: Path, tmp_path: Path) -> None:
+    with pytest.raises(Killed):
+        trained(data, tmp_path / "run", at={4: stop(Killed)})
+    with pytest.raises(RuntimeError, match="^$") as caught:
+        trained(data, tmp_path / "run", at_setup=stop(RuntimeError))
+    assert caught.type is RuntimeError
 
 
 STATES: list[dict[str, Any]] = [

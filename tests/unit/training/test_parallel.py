@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import pickle
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +34,7 @@ from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import node_code, param_names
 from gpe_pl.system import ranks
 from gpe_pl.training.module import MAX_IN_ROW, TrainingError, TrainingModule
-from gpe_pl.training.parallel import end_later_processes, sum_gradients
+from gpe_pl.training.parallel import SummedGradients, end_later_processes, sum_gradients
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
 from gpe_pl.trajectory.store import StoreError, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -276,6 +278,66 @@ def test_numbers_that_go_bad_on_one_rank_are_skipped_on_all_and_stop_all(mixed: 
     messages = on_ranks(tmp_path, on_rank)
     assert messages[0] == messages[1]
     assert "step 4: the loss is nan for (trajectory, frame) = (3, 17), (4, 17)" in messages[0]
+
+
+@pytest.mark.parametrize("clip", [1.0, None])
+def test_a_loss_that_overflows_changes_no_weight_though_its_gradient_is_finite(tmp_path: Path, clip: float | None) -> None:
+    """Its square is beyond single precision, its gradient is not. Ranks compute gradients nevertheless, because they wait for each other's."""
+
+    def on_rank(rank: int) -> tuple[bool, bool]:
+        m, data = module(), graph(12, MATERIALS, rank)
+        m._trainer = SimpleNamespace(global_step=4, log_every_n_steps=50)  # type: ignore[assignment]
+        if rank:
+            data["sand"].target[0] = 1e25
+        loss = m.training_step(Batch.from_data_list([data]), 0)
+        assert loss is not None
+        loss.backward()
+        sum_gradients(m.parameters())
+        is_finite = all(bool(p.grad.isfinite().all()) for p in m.parameters() if p.grad is not None)
+        m.configure_gradient_clipping(m.configure_optimizers()["optimizer"], clip)
+        return is_finite, all(p.grad is None for p in m.parameters())
+
+    assert on_ranks(tmp_path, on_rank) == [(True, True), (True, True)]
+
+
+def test_a_process_that_ends_is_reported_in_one_line_with_where_to_resume(
+    mixed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = Recorded.training_step
+
+    def training_step(self: Recorded, batch: Samples, batch_idx: int) -> torch.Tensor | None:
+        if self.global_step == 12 and ranks.rank() == 1:
+            raise RuntimeError("no memory")
+        return plain(self, batch, batch_idx)
+
+    def on_rank(rank: int) -> str:
+        with pytest.raises(RuntimeError) as caught:
+            trained(mixed, tmp_path / "run", rank, 2, BatchSize(3))
+        return f"{caught.type.__name__}: {caught.value}"
+
+    monkeypatch.setattr(Recorded, "training_step", training_step)
+    first, second = as_launched(tmp_path / "run" / "ranks", on_rank)
+    assert second == "RuntimeError: no memory"
+    assert first.startswith("RunError: the connection to the other processes of the training failed (RuntimeError: ")
+    assert first.endswith(f"run the same command again to resume from {tmp_path}/run/checkpoints/last.ckpt, step 10")
+    assert "\n" not in first
+
+
+def test_processes_that_were_started_end_before_lightning_notices() -> None:
+    """Lightning kills the main process if a process in its list fails."""
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    strategy = SummedGradients()
+    watched = [process]
+    strategy._launcher = SimpleNamespace(procs=watched)  # type: ignore[assignment]
+    strategy.on_exception(RuntimeError())
+    assert process.returncode == -signal.SIGKILL and watched == []
+
+
+def test_a_second_training_on_several_devices_is_refused(mixed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lightning would start no processes for it, and wait for them."""
+    monkeypatch.setattr(SummedGradients, "has_started_processes", True)
+    with pytest.raises(RunError, match=r"trainer.devices=2: this Python process has already trained on several devices; start each"):
+        trained(mixed, tmp_path / "run", 0, 2, BatchSize(3))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,24 @@
+"""Stages of a run of ``fit`` that need no training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from gpe_pl.config.fit_run import FitRun
+from gpe_pl.files.run_folder import RunError, claim
+
+
+@pytest.mark.parametrize(("budget", "is_explained"), [(1.0, True), (None, False)])
+def test_a_number_of_steps_that_follows_from_a_budget_is_explained(tmp_path: Path, budget: float | None, is_explained: bool) -> None:
+    claim(tmp_path, {"training": {"num_steps": 118}})
+    (tmp_path / "metrics.csv").touch()
+    run: Any = object.__new__(FitRun)
+    run.cfg, run.folder = SimpleNamespace(training=SimpleNamespace(budget_minutes=budget)), tmp_path
+    run._config = {"training": {"num_steps": 126}}
+    with pytest.raises(RunError, match=r"training.num_steps: 118 there, 126 now") as caught:
+        run.claim_folder()
+    assert ("follows from training.budget_minutes and the measured time of a step" in str(caught.value)) == is_explained
