@@ -60,7 +60,7 @@ def shapes_fault(shapes: Sequence[Shape], space: Periodicity) -> str | None:
         if isinstance(shape, Repeated) and shape.periodicity != space:
             return f"shape {k} repeats along {shape.periodicity}, the domain along {space}"
         inner = shape.shape if isinstance(shape, Repeated) else shape
-        if type(inner) in SHAPES.values() and (wrong := _fault(inner, len(space.bounds))):
+        if wrong := shape_fault(inner, len(space.bounds)):
             return f"shape {k} ({inner.kind}): {wrong}"
     return None
 
@@ -68,7 +68,10 @@ def shapes_fault(shapes: Sequence[Shape], space: Periodicity) -> str | None:
 _SCALARS = {"friction", "restitution", "radius", "offset", "spacing"}
 
 
-def _fault(shape: Shape, dim: int) -> str | None:
+def shape_fault(shape: Shape, dim: int) -> str | None:
+    """Describe the first rule of ``shapes_fault`` that a shape in ``dim`` dimensions breaks; None if it breaks none, or is of another class."""
+    if type(shape) not in SHAPES.values():
+        return None
     values: dict[str, np.ndarray] = {}
     for key in (f.name for f in fields(shape) if f.name != "encoded"):  # type: ignore[arg-type]
         try:

@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 
 from gpe_pl.errors import GpeError
 from gpe_pl.errors.printable import did_you_mean
+from gpe_pl.geometry.shape_values import shape_fault
 from gpe_pl.geometry.shapes import Shape, domain_walls, signed_distance
 from gpe_pl.geometry.terrain import Up
 from gpe_pl.learned.pretrained import model_name, names
@@ -52,6 +53,10 @@ SHIPPED = {"sand": "sand", "snow": "snow", "elastomer": "elastomer", "fluid": "f
 """Shipped model of each material, which a scene takes if none is named."""
 
 
+def _is_friction(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, (int, float)) and 0 <= value < math.inf
+
+
 class SceneFault(GpeError, ValueError):
     """Raised when a scene is impossible. The message names each body or obstacle with its fault, and ``faults`` has them by name."""
 
@@ -70,7 +75,7 @@ class Scene:
         friction: Coulomb coefficient of the walls, or one per wall by name (``x_low``, ``x_high``, ``y_low``, …).
         title: name of the scene in pictures.
         bodies, obstacles, zones: parts that were added, by name; zones are inlets and outlets.
-        seed: seed of the random displacements of nodes from their lattice.
+        seed: integer of at least 0, seed of the random displacements of nodes from their lattice.
         spacing, frame_dt: spacing of nodes [m] and frame interval [s], for models of several; None takes those that a model names.
 
     Raises:
@@ -83,7 +88,7 @@ class Scene:
     title: str = "scene"
     bodies: tuple[Body, ...] = ()
     obstacles: tuple[tuple[str, Any], ...] = ()
-    seed: int = 0
+    seed: Any = 0
     zones: tuple[Zone, ...] = ()
     spacing: float | int | None = None
     frame_dt: float | int | None = None
@@ -97,6 +102,8 @@ class Scene:
         if len(box) not in (2, 3) or not all(math.isfinite(high - low) and low < high for low, high in box):
             raise SceneFault({"box": f"{fault}, got {self.box!r}"})
         object.__setattr__(self, "box", box)
+        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
+            raise SceneFault({"seed": f"must be a whole number of at least 0, got {self.seed!r}"})
         for name in ("spacing", "frame_dt"):
             if getattr(self, name) is not None:
                 self._positive("", name, getattr(self, name))
@@ -104,7 +111,7 @@ class Scene:
         object.__setattr__(self, "gravity", tuple(self._vector("gravity", "gravity", down).tolist()))
         walls = {f"{axis}_{side}" for axis in "xyz"[: len(box)] for side in ("low", "high")}
         given = self.friction if isinstance(self.friction, dict) else dict.fromkeys(walls, self.friction)
-        if set(given) != walls or not all(isinstance(mu, (int, float)) and mu >= 0 for mu in given.values()):
+        if set(given) != walls or not all(map(_is_friction, given.values())):
             raise SceneFault(
                 {"friction": f"must be a number of at least 0, or one for each of {', '.join(sorted(walls))}, got {self.friction!r}"}
             )
@@ -183,11 +190,15 @@ class Scene:
         if mesh is None:
             if not isinstance(shape, Shape):
                 raise SceneFault({name: f"must be a shape, such as Circle((0.5, 0.2), 0.1), got {shape!r}"})
+            if fault := shape_fault(shape, self.dim):
+                raise SceneFault({name: fault})
             return replace(self, obstacles=(*self.obstacles, (name, shape)))
         if up not in ("x", "y", "z"):
             raise SceneFault({name: f"up={up!r}: must be x, y or z"})
         if size is not None:
             self._positive(name, "size", size)
+        if not _is_friction(friction):
+            raise SceneFault({name: f"friction={friction!r}: must be a number of at least 0"})
         if not Path(mesh).is_file():
             raise SceneFault({name: f"mesh={mesh}: no such file (searched from {Path.cwd()})"})
         placed = MeshObstacle(Path(mesh), None if at is None else self._vector(name, "at", at), size, up, float(friction))

@@ -18,6 +18,7 @@ Keys are the arguments of ``Scene`` and its methods. The first key of a part nam
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,21 @@ LISTS = ("bodies", "obstacles", "openings")
 TOP = ("box", "gravity", "friction", "title", "seed", "spacing", "frame_dt", *LISTS)
 BODIES = ("block", "ball", "polygon", "image")
 OPENINGS = ("inlet", "outlet")
+
+
+class _Loader(yaml.SafeLoader):
+    """Loader of YAML that refuses a key given twice, and reads 1e5 as a number. YAML 1.1 takes the last value of a key, and reads 1e5 as text."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        lines: dict[Any, int] = {}
+        for key, _ in node.value:
+            line = key.start_mark.line + 1
+            if lines.setdefault(key.value, line) != line:
+                raise SceneFault({str(key.value): f"occurs in line {lines[key.value]} and again in line {line}; put all into one"})
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789"))
 
 
 def _box(low: Any, high: Any, friction: float = FRICTION) -> Box:
@@ -58,7 +74,7 @@ def read_scene(path: Path | str) -> Scene:
     try:
         if path.stat().st_size > MOST_BYTES:
             raise SceneFault({str(path): f"has more than {MOST_BYTES:,} bytes, too many for a scene"})
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # a SafeLoader
     except FileNotFoundError:
         raise SceneFault({str(path): f"no such file (searched from {Path.cwd()})"}) from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -73,7 +89,8 @@ def read_scene(path: Path | str) -> Scene:
             raise SceneFault({str(key): f"unknown key{did_you_mean(str(key), TOP)}; keys are {', '.join(TOP)}"})
     if "box" not in values:
         raise SceneFault({"box": "is missing; give the sides [m], such as box: [1.0, 1.0]"})
-    scene = Scene(**{"title": path.stem, **{key: value for key, value in values.items() if key not in LISTS}})
+    given = {key: value for key, value in values.items() if key not in LISTS}
+    scene = Scene(**{**given, "title": str(given.get("title", path.stem))})
     for number, part in enumerate(_list(values, "bodies"), 1):
         kind, first, given = _kind(f"bodies, part {number}", part, BODIES)
         material = str(first)

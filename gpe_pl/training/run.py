@@ -6,7 +6,8 @@ import logging
 import os
 import shutil
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -265,9 +266,23 @@ def train(
         log.info("resuming from %s", last)
     for known in KNOWN_WARNINGS:
         warnings.filterwarnings("ignore", known)
+    with _said_how_to_continue(checkpoints, trainer), interruption, checkpoints.taken_up():
+        trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
+    if checkpoints.best_step == 0:
+        log.warning(
+            "start_from: every validation was clearly worse than the model at the start, so %s is that model; the trained one is %s. "
+            "Try a lower training.learning_rate or more trajectories",
+            checkpoints.best,
+            checkpoints.last,
+        )
+    return checkpoints.best
+
+
+@contextmanager
+def _said_how_to_continue(checkpoints: Checkpoints, trainer: L.Trainer) -> Iterator[None]:
+    """Name the last checkpoint in errors that end a training: an interruption, numbers that are not finite, or the end of another process."""
     try:
-        with interruption, checkpoints.taken_up():
-            trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
+        yield
     except SystemExit:  # Lightning's answer to an interruption
         if trainer.global_rank > 0:
             raise
@@ -284,14 +299,6 @@ def train(
             f"the connection to the other processes of the training failed ({reason(error)}). If one of them has ended, its message is above; "
             f"{_how_to_continue(checkpoints)}"
         ) from None
-    if checkpoints.best_step == 0:
-        log.warning(
-            "start_from: every validation was clearly worse than the model at the start, so %s is that model; the trained one is %s. "
-            "Try a lower training.learning_rate or more trajectories",
-            checkpoints.best,
-            checkpoints.last,
-        )
-    return checkpoints.best
 
 
 def _how_to_continue(checkpoints: Checkpoints) -> str:

@@ -133,6 +133,14 @@ FAULTS: list[tuple[Callable[[], Any], str]] = [
     (lambda: column().obstacle(mesh="part.stl"), "obstacle 1: mesh=part.stl: no such file"),
     (lambda: column().obstacle(), "obstacle 1: give either a shape, such as Circle"),
     (lambda: column().obstacle("circle"), "obstacle 1: must be a shape, such as Circle((0.5, 0.2), 0.1), got 'circle'"),
+    (lambda: column().obstacle(Circle((0.5, 0.2), -0.1)), "obstacle 1: radius is -0.1 m, must be positive"),
+    (lambda: column().obstacle(Circle((0.5, 0.2), float("nan"))), "obstacle 1: not finite: radius"),
+    (lambda: column().obstacle(Circle((0.5, 0.2), 0.1, friction=-5)), "obstacle 1: friction is -5, must be at least 0"),
+    (lambda: column().obstacle(Box((0.5, 0.0), (0.4, 0.2), 0.4)), "obstacle 1: low must be below high along every axis"),
+    (lambda: column().obstacle(mesh="part.stl", friction=-1), "obstacle 1: friction=-1: must be a number of at least 0"),
+    (lambda: Scene(box=(1.0, 1.0), friction=float("inf")), "friction: must be a number of at least 0"),
+    (lambda: Scene(box=(1.0, 1.0), seed=-1), "seed: must be a whole number of at least 0, got -1"),
+    (lambda: Scene(box=(1.0, 1.0), seed=1.5), "seed: must be a whole number of at least 0, got 1.5"),
     (lambda: Scene(box=(1.0, 1.0)).predict("sand"), "the scene has no body; add one"),
     (lambda: Scene(box=(1.0, 1.0)).predict(), "model: name one for the scene; shipped models"),
     (lambda: column().predict("fem"), "block 1 (sand): the model is for solid"),
@@ -144,7 +152,7 @@ FAULTS: list[tuple[Callable[[], Any], str]] = [
     (lambda: column().block("sand", (0.15, 0.1), (0.3, 0.3)).predict(), "block 2 (sand): overlaps block 1 (sand); move one of the two"),
     (lambda: column().obstacle(Circle((0.2, 0.1), 0.05)).predict(), "block 1 (sand): 27 of its 128 nodes are inside obstacle 1; move one of the two"),
     (lambda: column().obstacle(Circle((3.0, 0.5), 0.1)).predict(), "obstacle 1: no part of its surface is in the box; move it, or leave it out"),
-    (lambda: column().obstacle(Box((0.5, 0.0, 0.0), (0.6, 0.1, 0.1), 0.4)).predict(), "obstacle 1: Box"),
+    (lambda: column().obstacle(Box((0.5, 0.0, 0.0), (0.6, 0.1, 0.1), 0.4)).predict(), "obstacle 1: low must have 2 components"),
 ]  # fmt: skip
 
 
@@ -186,6 +194,12 @@ def test_a_file_is_the_same_scene(tmp_path: Path) -> None:
         ("radius: 0.1", "radius: wide", "obstacle 1: has a value of a wrong kind"),
         ("box: [1.0, 1.0]", "box: [1.0, ", "is no YAML, at line"),
         ("[0.1, 0.0]", "[0.1]", "block 1 (sand): at=[0.1]: must be 2 numbers"),
+        (
+            "obstacles:",
+            "obstacles:\n  - {circle: [0.2, 0.8], radius: 0.1}\nobstacles:",
+            "obstacles: occurs in line 6 and again in line 8; put all into one",
+        ),
+        ("box: [1.0, 1.0]", "box: [1.0, 1.0]\nseed: abc", "seed: must be a whole number of at least 0, got 'abc'"),
     ],
 )
 def test_faults_of_a_file_are_named(tmp_path: Path, before: str, after: str, message: str) -> None:
@@ -193,6 +207,18 @@ def test_faults_of_a_file_are_named(tmp_path: Path, before: str, after: str, mes
     with pytest.raises(SceneFault) as caught:
         read_scene(tmp_path / "scene.yaml")
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("value", ["1e-1", "1E-1", "+1.0e-1", "100e-3", ".1", "0.1"])
+def test_numbers_have_exponents_with_and_without_a_point(tmp_path: Path, value: str) -> None:
+    (tmp_path / "scene.yaml").write_text(FILE.replace("friction: 0.3", f"friction: {value}"))
+    assert read_scene(tmp_path / "scene.yaml").friction == 0.1
+
+
+@pytest.mark.parametrize("title", ["2024", "2024-05-01", "yes"])
+def test_a_title_is_text(tmp_path: Path, title: str) -> None:
+    (tmp_path / "scene.yaml").write_text(f"title: {title}\n{FILE}")
+    assert isinstance(read_scene(tmp_path / "scene.yaml").title, str)
 
 
 def test_predict_writes_a_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
