@@ -12,7 +12,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.nn.fused import unfused
 from gpe_pl.reports.domain_table import compares_models
 from gpe_pl.reports.finished_runs import Run, distinct_runs, run_name
-from gpe_pl.reports.sweep_table import FORWARD_TIMES, variants_of
+from gpe_pl.reports.sweep_table import FORWARD_TIMES, network_digest, networks_in, variants_of
 from gpe_pl.system.timing import paired_ratio, paired_times
 
 NUM_NODES, NUM_EDGES = 600, 6000
@@ -39,7 +39,12 @@ def measure_forward_times(folder: Path, runs: list[Run], num_rounds: int = 30) -
     path = folder / FORWARD_TIMES
     first_runs = [members[0] for members in variants_of(runs)[1].values()] if runs else []
     names = [run_name(run, folder) for run in first_runs]
-    if len(names) < 2 or compares_models(runs) or (path.exists() and sealed.read(path, "delete it to measure again").keys() == {*names}):
+    networks = {name: network_digest(run) for name, run in zip(names, first_runs, strict=True)}
+    if (
+        len(names) < 2
+        or compares_models(runs)
+        or (path.exists() and networks_in(sealed.read(path, "delete it to measure again")) == networks)
+    ):
         return
     alternatives = {}
     for name, run in zip(names, first_runs, strict=True):
@@ -52,4 +57,4 @@ def measure_forward_times(folder: Path, runs: list[Run], num_rounds: int = 30) -
     torch.set_num_threads(1)
     times = paired_times(alternatives, num_rounds)
     torch.set_num_threads(threads)
-    sealed.write(path, {name: paired_ratio(times, name, names[0]) for name in names})
+    sealed.write(path, {name: {"ratio": paired_ratio(times, name, names[0]), "network": networks[name]} for name in names})

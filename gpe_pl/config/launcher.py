@@ -88,12 +88,13 @@ class Job:
         result = self.folder / ".result"
         here = [f"hydra.run.dir={json.dumps(str(self.folder))}", "hydra.mode=RUN", *self.settings]
         with open(self.folder / LOG, "ab") as log:
+            logged_before = log.tell()
             command = [sys.executable, "-m", module, *self.overrides, *here]
             environment = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"} | {RESULT: str(result)}
             with subprocess.Popen(command, stdout=log, stderr=log, stdin=subprocess.PIPE, env=environment, cwd=self.directory) as process:
                 code = process.wait()
         if code:
-            return self.failed((UsageError if code == USAGE_ERROR else SweepError)(self._last_words(code)))
+            return self.failed((UsageError if code == USAGE_ERROR else SweepError)(self._last_words(code, logged_before)))
         value = json.loads(result.read_text(encoding="utf-8"))
         result.unlink()
         return JobReturn(self.overrides, status=JobStatus.COMPLETED, _return_value=value)
@@ -110,9 +111,15 @@ class Job:
             lines = str(error).strip().splitlines() or [""]
             return self.failed(SweepError(f"{type(error).__name__}: {lines[-1]} (see {self.folder / LOG})"))
 
-    def _last_words(self, code: int) -> str:
-        lines = (self.folder / LOG).read_text(encoding="utf-8", errors="replace").splitlines()
-        last = next((line for line in reversed(lines) if line.strip()), f"ended with code {code}")
+    def _last_words(self, code: int, logged_before: int) -> str:
+        """Return why a run failed: its last error message, else its last line, behind the first ``logged_before`` bytes of its log; or the signal."""
+        logged = (self.folder / LOG).read_bytes()[logged_before:].decode("utf-8", errors="replace")
+        lines = [line for line in reversed(logged.splitlines()) if line.strip()]
+        last = next((line for line in lines if line.startswith("error: ")), lines[0] if lines else f"ended with code {code}")
+        if code == -signal.SIGKILL:
+            last = "killed (by SIGKILL, as the system does when memory is short)"
+        elif code < 0:
+            last = f"ended by signal {signal.Signals(-code).name}"
         return f"{last.removeprefix('error: ')} (see {self.folder / LOG})"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -334,8 +335,13 @@ def _spread(length: int, count: int) -> np.ndarray:
 
 
 def _set_up_worker(_: int) -> None:
+    """Keep signals to a group of processes away from a worker, such as those of Ctrl-C and of ``timeout``: training needs its workers until it has saved."""
     torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, but training needs its workers until it has saved
+    if hasattr(os, "setpgid"):
+        os.setpgid(0, 0)
+    for name in ("SIGINT", "SIGUSR1", "SIGUSR2"):  # by SIGTERM, PyTorch ends a worker that does not end by itself
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
 
 
 def _whole(stored: StoredTrajectory) -> Trajectory:

@@ -128,6 +128,11 @@ class LearnedSimulator(nn.Module):
         self.builder = replace(self.builder, skips=skips)
         self.model.skips = skips
 
+    @property
+    def frame_dt(self) -> float:
+        """Frame interval [s]."""
+        return self.builder.metadata.frame_dt
+
     def configured(self, **settings: Unpack[RolloutSettings]) -> LearnedSimulator:
         """Return a copy with other settings; None keeps a setting. The copy shares the weights and leaves this simulator unchanged."""
         other = copy.copy(self)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import hashlib
+import json
 import logging
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -218,9 +220,22 @@ def forward_time_ratios(folder: Path, variants: dict[Variant, list[Run]]) -> dic
     path = folder / FORWARD_TIMES
     if not path.exists():
         return {}
-    ratios = sealed.read(path, "delete it; the command of the sweep measures again")
+    measured = sealed.read(path, "delete it; the command of the sweep measures again")
     names = {variant: run_name(members[0], folder) for variant, members in variants.items()}
-    return {variant: ratios[name] for variant, name in names.items()} if {*names.values()} == ratios.keys() else {}
+    if networks_in(measured) != {names[variant]: network_digest(members[0]) for variant, members in variants.items()}:
+        return {}
+    return {variant: measured[name]["ratio"] for variant, name in names.items()}
+
+
+def network_digest(run: Run) -> str:
+    """Return a digest of the settings that the forward time of a run's model depends on: those of its network and of its graphs."""
+    settings = {key: value for key, value in run.config.items() if key.startswith(("model.", "graph."))}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def networks_in(measured: Mapping[str, Any]) -> dict[str, str]:
+    """Return the digests of the networks in a file of forward times, by the name of their run; empty for a file of an earlier version."""
+    return {name: entry["network"] for name, entry in measured.items() if isinstance(entry, dict)}
 
 
 def _markdown(axes: list[str], variants: dict[Variant, list[Run]], ratios: dict[Variant, float]) -> str:

@@ -124,15 +124,24 @@ class GroundTruth(Protocol):
 
 
 def unfit(simulator: Simulator, metadata: Metadata) -> Termination | None:
-    """Return the reason why a solver cannot compute a scene: another frame interval, or other materials than its metadata. None means that it can."""
-    if not isinstance(simulator, GroundTruth):
+    """Return the reason why a simulator cannot compute a scene: another frame interval, or a solver for other materials. None means that it can."""
+    own = _innermost(simulator)
+    frame_dt, wrong = getattr(own, "frame_dt", metadata.frame_dt), ""
+    solver = f"the solver {own.name}" if isinstance(own, GroundTruth) else "the model"
+    if not math.isclose(frame_dt, metadata.frame_dt, rel_tol=1e-6):
+        wrong = f"{solver} has frame_dt = {frame_dt:g} s, the scene {metadata.frame_dt:g} s"
+    elif not isinstance(simulator, GroundTruth):
         return None
-    solver, wrong = f"the solver {simulator.name}", ""
-    if not math.isclose(simulator.frame_dt, metadata.frame_dt, rel_tol=1e-6):
-        wrong = f"{solver} has frame_dt = {simulator.frame_dt:g} s, the scene {metadata.frame_dt:g} s"
     elif tuple(simulator.materials) != metadata.materials:
         wrong = f"{solver} has the materials {', '.join(simulator.materials)}, the scene {', '.join(metadata.materials)}, in this order"
-    return Termination("input", 0, -1, f"{wrong}; give the solver those of the scene") if wrong else None
+    return Termination("input", 0, -1, f"{wrong}; both must be the same") if wrong else None
+
+
+def _innermost(simulator: Any) -> Any:
+    """Return the simulator inside wrappers such as containment; of an ensemble, that of its first member."""
+    while (inner := getattr(simulator, "simulator", None) or next(iter(getattr(simulator, "members", ())), None)) is not None:
+        simulator = inner
+    return simulator
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from gpe_pl.errors import GpeError
@@ -64,7 +65,7 @@ def parsed(arguments: Sequence[str], word: str, keys: Mapping[str, Callable[[str
         key, equals, value = argument.lstrip("-").partition("=")
         if argument.startswith("-"):
             raise ArgumentFault(f"{argument}: settings have no dashes; write {key}={value or '…'} ({listed})")
-        if not equals:
+        if not equals or (key not in keys and ("/" in key or Path(argument).exists())):  # folders of sweeps have names such as seed=0
             words.append(argument)
         elif key not in keys:
             raise ArgumentFault(f"{key}: unknown key{did_you_mean(key, keys)}; {listed}")

@@ -287,18 +287,33 @@ def _said_how_to_continue(checkpoints: Checkpoints, trainer: L.Trainer) -> Itera
         if trainer.global_rank > 0:
             raise
         raise RunError(f"interrupted; {_how_to_continue(checkpoints)}") from None
-    except TrainingError as error:
+    except GpeError as error:
+        if not isinstance(error, TrainingError):
+            raise _from_worker(error) from None
         saved = checkpoints.where_saved()
         raise TrainingError(
             f"{error}; {'no checkpoint was saved yet' if saved is None else f'the last good checkpoint is kept: {saved}'}"
         ) from None
     except RuntimeError as error:
-        if isinstance(error, GpeError) or not came_through(error, "torch.distributed"):
+        if "DataLoader worker" in str(error) and came_through(error, "torch.utils.data.dataloader"):
+            raise RunError(
+                f"a process of trainer.num_workers has ended ({reason(error)}); if memory is short, lower trainer.num_workers; "
+                f"{_how_to_continue(checkpoints)}"
+            ) from None
+        if not came_through(error, "torch.distributed"):
             raise
         raise RunError(
             f"the connection to the other processes of the training failed ({reason(error)}). If one of them has ended, its message is above; "
             f"{_how_to_continue(checkpoints)}"
         ) from None
+
+
+def _from_worker(error: GpeError) -> GpeError:
+    """Return an error without the report that PyTorch puts around it if a process of ``trainer.num_workers`` raised it."""
+    if not str(error).startswith(f"Caught {type(error).__name__} in DataLoader worker"):
+        return error
+    kind = type(error)
+    return kind(str(error).rpartition(f"{kind.__module__}.{kind.__qualname__}: ")[2])
 
 
 def _how_to_continue(checkpoints: Checkpoints) -> str:

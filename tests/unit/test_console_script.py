@@ -77,6 +77,15 @@ def test_arguments_are_answered_in_a_line(arguments: list[str], message: str) ->
     assert str(caught.value) == message
 
 
+def test_a_folder_of_a_sweep_is_a_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "depth=3").mkdir()
+    for word in ("depth=3", "runs/mine/depth=3", str(tmp_path / "depth=3")):
+        assert parsed([word, "seed=3"], "model", {"seed": integer(0, 9)}) == (word, {"seed": 3})
+    with pytest.raises(ArgumentFault, match="depth: unknown key"):
+        parsed(["depth=4"], "model", {"seed": integer(0, 9)})
+
+
 def test_arguments_have_types() -> None:
     assert parsed(["sand", "seed=3", "open=False"], "model", {"seed": integer(0, 9), "open": truth}) == ("sand", {"seed": 3, "open": False})
     assert number(0.0, 1.0)("0.5") == 0.5

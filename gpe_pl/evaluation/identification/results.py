@@ -76,7 +76,8 @@ class Task:
         if observed.digest in self.calibrated_on:
             raise ObservationError(f"{name}: this motion is one of those that the calibration is from; calibrate on other scenes")
         answers: dict[str, Answer] = {}
-        is_new = False
+        misfit, motion = (folder / FOLDER / f"{name}_{what}.png" for what in ("misfit", "motion"))
+        is_drawn = misfit.exists() and motion.exists()
         for kind in self.simulators:
             path = answer_path(folder, name, kind)
             if not path.exists():
@@ -93,16 +94,16 @@ class Task:
                         search_settings=self.search, calibration=self.calibrations.get(kind), scene=name, on_progress=on_progress,
                     )  # fmt: skip
                 answer.write(folder)
-                is_new = True
+                is_drawn = False
             answers[kind] = read_answer(path)
             if answers[kind].observed != observed.digest:
                 raise ObservationError(
                     f"{path}: is the answer for another motion than that of {name} in the trajectories now; choose another name=… or delete {folder}"
                 )
         sought = unknowns_of(observed.completed, self.unknowns, bounds, self.per_body)
-        if is_new:
-            save_figure(misfit_figure(answers), folder / FOLDER / f"{name}_misfit.png", dpi=110)
-            save_figure(self._motion(trajectory, sought, answers), folder / FOLDER / f"{name}_motion.png", dpi=110)
+        if not is_drawn:
+            save_figure(misfit_figure(answers), misfit, dpi=110)
+            save_figure(self._motion(trajectory, sought, answers), motion, dpi=110)
         yield from side_by_side(answers)
         yield from (f"{kind}: {answer.gradients}" for kind, answer in answers.items() if answer.gradients)
 

@@ -23,6 +23,12 @@ if x == "bad":
     sys.exit("error: x is bad")
 if x == "wrong":
     sys.exit(64)
+if x == "noisy":
+    print("error: it broke", "6/6 0:00:00", sep="\\n")
+    sys.exit(1)
+if x == "killed":
+    sys.stdout.flush()
+    os.kill(os.getpid(), 9)
 Path(os.environ["GPE_PL_RESULT"]).write_text(json.dumps(float(x) ** 2))
 """
 
@@ -92,6 +98,16 @@ def launched(launcher: Fixed, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     monkeypatch.setattr("gpe_pl.config.launcher.setup_globals", lambda: None)
     monkeypatch.setattr("sys.modules", {**sys.modules, "__main__": pytest})
     return launcher.launch([[name] for name in launcher.ends], 0)
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"), [("noisy", "it broke"), ("killed", "killed (by SIGKILL, as the system does when memory is short)")]
+)
+def test_a_failed_job_says_why(folder: Path, value: str, reason: str) -> None:
+    log = folder / "sweep" / f"x={value}" / "output.log"
+    log.parent.mkdir(parents=True)
+    log.write_text("error: of an earlier start\n")
+    assert outcomes(ProcessLauncher(1), folder, value) == {value: f"{reason} (see {log})"}
 
 
 def test_values_of_good_jobs_are_there_though_others_failed(monkeypatch: pytest.MonkeyPatch) -> None:

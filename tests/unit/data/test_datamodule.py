@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import multiprocessing
+import os
 import re
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +18,7 @@ import pytest
 import torch
 
 from gpe_pl.data.checksum import split_checksum
-from gpe_pl.data.datamodule import TrajectoryDataModule
+from gpe_pl.data.datamodule import TrajectoryDataModule, _set_up_worker
 from gpe_pl.data.dataset import CachedGraphs, WindowDataset
 from gpe_pl.data.importers import save_dataset
 from gpe_pl.data.noise import Noise
@@ -54,6 +57,21 @@ def datamodule(root: Path, step: int = 0, **settings: Any) -> TrajectoryDataModu
 
 def first_batches(module: TrajectoryDataModule, count: int) -> list[Any]:
     return list(itertools.islice(module.train_dataloader(), count))
+
+
+def _group_and_handlers(results: Any) -> None:
+    _set_up_worker(0)
+    results.put((os.getpgid(0) == os.getpid(), signal.getsignal(signal.SIGUSR1), signal.getsignal(signal.SIGTERM)))
+
+
+def test_signals_to_the_group_of_a_training_do_not_reach_its_workers() -> None:
+    """Training needs them until it has saved. SIGTERM alone ends a worker, as PyTorch does."""
+    context = multiprocessing.get_context("fork")
+    results = context.SimpleQueue()
+    process = context.Process(target=_group_and_handlers, args=(results,))
+    process.start()
+    process.join()
+    assert results.get() == (True, signal.SIG_IGN, signal.getsignal(signal.SIGTERM))
 
 
 def test_a_resumed_loader_continues_the_sequence(root: Path) -> None:

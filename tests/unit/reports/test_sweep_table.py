@@ -67,13 +67,19 @@ def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path)
 
 
 def test_forward_times_are_shown_where_all_variants_have_them(runs: Path) -> None:
-    ratios = {f"{name}/0": 1.0 + k / 4 for k, name in enumerate(("directed", "negated", "odd", "odd_even"))}
+    networks = {run.folder.relative_to(runs).as_posix(): sweep_table.network_digest(run) for run in finished_runs(runs)}
+    names = [f"{name}/0" for name in ("directed", "negated", "odd", "odd_even")]
+    ratios = {name: {"ratio": 1.0 + k / 4, "network": networks[name]} for k, name in enumerate(names)}
     sealed.write(runs / "forward_times.json", ratios)
     sweep_table.report_sweep(runs, finished_runs(runs))
     assert [cells(runs, name)[0][3] for name in ("directed", "negated", "odd", "odd_even")] == ["1.00", "1.25", "1.50", "1.75"]
     sealed.write(runs / "forward_times.json", {key: value for key, value in ratios.items() if key != "odd/0"})
     sweep_table.report_sweep(runs, finished_runs(runs))
     assert cells(runs, "negated")[0][3] == "–"
+    for changed in ({"network": "of another model", "ratio": 1.0}, 1.0):  # of runs that were deleted, and as earlier versions wrote it
+        sealed.write(runs / "forward_times.json", {**ratios, "odd/0": changed})
+        sweep_table.report_sweep(runs, finished_runs(runs))
+        assert cells(runs, "negated")[0][3] == "–"
 
 
 def test_failed_rollouts_are_counted(runs: Path) -> None:

@@ -12,6 +12,8 @@ import pytest
 import torch
 
 from gpe_pl.geometry.shapes import Box
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.ensemble import Ensemble
 from gpe_pl.rollout.guard import Guard, _depth_through
 from gpe_pl.rollout.loop import Replay, SimulationError, Simulator, Start, fraction_outside, frames, rollout, rollouts
 from gpe_pl.trajectory import integrators
@@ -54,6 +56,24 @@ def test_oracle(trajectory: Trajectory) -> None:
         np.testing.assert_array_equal(getattr(result.boundary, key), getattr(trajectory.boundary, key), err_msg=key)
     assert result.metadata == trajectory.metadata
     assert result.termination is None
+
+
+class Paced(FreeFall):
+    """A model that knows its frame interval."""
+
+    @property
+    def frame_dt(self) -> float:
+        return self.dt
+
+
+@pytest.mark.parametrize("wrapped", [lambda s: s, lambda s: Contained(s, s.dt), lambda s: Ensemble((Contained(s, s.dt), s))])
+def test_a_model_of_other_frames_than_the_scene_is_refused(trajectory: Trajectory, wrapped: Callable[[Simulator], Simulator]) -> None:
+    """The times of the result would be wrong."""
+    dt = trajectory.metadata.frame_dt
+    stop = rollout(wrapped(Paced(2 * dt)), trajectory.state(0), 2, trajectory.metadata).termination
+    assert stop is not None and (stop.reason, stop.frame) == ("input", 0)
+    assert f"the model has frame_dt = {2 * dt:g} s, the scene {dt:g} s" in stop.message
+    assert rollout(wrapped(Paced(dt)), trajectory.state(0), 2, trajectory.metadata).num_frames == 3
 
 
 def test_oracle_survives_hundreds_of_inexact_time_steps(new_trajectory: New) -> None:

@@ -99,7 +99,7 @@ def trained(
 
     class Disturbed(TrainingModule):
         def setup(self, stage: str) -> None:
-            self.trainer.log_every_n_steps = 1
+            self.trainer.log_every_n_steps = 1  # type: ignore[attr-defined]
             at_setup()
 
         def training_step(self, batch: Any, batch_idx: int) -> torch.Tensor | None:

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import math
+import re
 import shutil
 from pathlib import Path
 from typing import Any
 
+import lightning as L
 import pytest
 import torch
 from lightning.pytorch.utilities import rank_zero_only
 
 from gpe_pl.files import sealed
 from gpe_pl.files.run_folder import RunError, claim, without_orphans, without_tables
+from gpe_pl.training.callbacks import RolloutValidation
+from gpe_pl.training.checkpoints import Checkpoints
+from gpe_pl.training.interruption import Interruption
 from gpe_pl.training.parallel import end_later_processes
-from gpe_pl.training.run import TrainerSettings, adopt, set_up
+from gpe_pl.training.run import TrainerSettings, _said_how_to_continue, adopt, set_up
+from gpe_pl.trajectory.store import StoreError
 
 CONFIG: dict[str, Any] = {"seed": 0, "model": {"depth": 3}, "training": {"batch_size": 2}}
 BY_NODES = {**CONFIG, "batching": {"max_nodes": 500}}
@@ -82,6 +89,38 @@ def test_of_processes_started_together_one_takes_the_model(tmp_path: Path, monke
     assert not (tmp_path / "now").exists()
     with pytest.raises(SystemExit):
         end_later_processes()
+
+
+def fail_as(module: str, error: Exception) -> None:
+    """Raise an error in a function of another module."""
+    exec("def fail(error):\n    raise error", code := {"__name__": module})
+    code["fail"](error)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (
+            RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed. "),
+            r"RunError: a process of trainer.num_workers has ended \(RuntimeError: DataLoader worker .*; if memory is short, lower "
+            r"trainer.num_workers; nothing was saved yet, the same command starts again",
+        ),
+        (
+            StoreError(
+                "Caught StoreError in DataLoader worker process 0.\nOriginal Traceback:\n  File x\ngpe_pl.trajectory.store.StoreError: shard-0.h5: damaged\n"
+            ),
+            "StoreError: shard-0.h5: damaged",
+        ),
+        (StoreError("shard-0.h5: damaged"), "StoreError: shard-0.h5: damaged"),
+        (RuntimeError("shapes differ"), "RuntimeError: shapes differ"),
+    ],
+)
+def test_errors_of_workers_are_one_line(tmp_path: Path, error: Exception, message: str) -> None:
+    checkpoints = Checkpoints(tmp_path, math.inf, Interruption(), RolloutValidation([], 1))
+    trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False)
+    with pytest.raises(type(error)) as caught, _said_how_to_continue(checkpoints, trainer):
+        fail_as("torch.utils.data.dataloader", error)
+    assert re.fullmatch(message, f"{caught.type.__name__}: {caught.value}")
 
 
 def test_a_gpu_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

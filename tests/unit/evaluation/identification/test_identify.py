@@ -458,8 +458,10 @@ def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.Monke
     assert {path.name for path in (tmp_path / "scenes").glob("*.png")} == {"first_misfit.png", "first_motion.png"}
     before = read_answers(tmp_path, "model")
     monkeypatch.setattr("gpe_pl.evaluation.identification.results.identify_parameters", None)
+    (tmp_path / "scenes" / "first_motion.png").unlink()  # as after an interruption between answer and pictures
     assert [*task.run("first", seen, tmp_path)] == [line]
     assert read_answers(tmp_path, "model") == before
+    assert (tmp_path / "scenes" / "first_motion.png").exists()
     with pytest.raises(ObservationError, match=r"first_model\.json: is the answer for another motion than that of first"):
         list(task.run("first", replace(seen, pos=seen.pos + 0.01), tmp_path))
     known = replace(task, calibrated_on={Observations.of(seen).digest})
