@@ -61,8 +61,8 @@ def hidden_nodes(trajectory: Trajectory, frame: int) -> list[str]:
 
 
 def time_decimals(frame_dt: float) -> int:
-    """Return the number of decimals that times of frames need: those of the time between frames [s], of which up to six significant digits count."""
-    digits, exponent = f"{frame_dt:.5e}".split("e")
+    """Return the number of decimals that times of frames need: those of the time between frames [s], of which up to three significant digits count."""
+    digits, exponent = f"{frame_dt:.2e}".split("e")
     return max(0, len(digits.rstrip("0").partition(".")[2]) - int(exponent))
 
 

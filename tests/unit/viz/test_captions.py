@@ -157,7 +157,7 @@ def test_a_distance_between_predictions_is_no_error() -> None:
         (11, 0.02, "0.22 s"),
         (5, 0.1, "0.5 s"),
         (3, 40.0, "120 s"),
-        (59, 1 / 60, "0.9833333 s"),
+        (59, 1 / 60, "0.9833 s"),
     ],
 )
 def test_times_are_as_exact_as_the_time_between_frames(frame, frame_dt, expected):
