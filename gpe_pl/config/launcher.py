@@ -116,10 +116,9 @@ class Job:
         logged = (self.folder / LOG).read_bytes()[logged_before:].decode("utf-8", errors="replace")
         lines = [line for line in reversed(logged.splitlines()) if line.strip()]
         last = next((line for line in lines if line.startswith("error: ")), lines[0] if lines else f"ended with code {code}")
-        if code == -signal.SIGKILL:
-            last = "killed (by SIGKILL, as the system does when memory is short)"
-        elif code < 0:
-            last = f"ended by signal {signal.Signals(-code).name}"
+        if code < 0:
+            name = {s.value: s.name for s in signal.Signals}.get(-code, str(-code))
+            last = f"ended by signal {name}" if name != "SIGKILL" else "killed (by SIGKILL, as the system does when memory is short)"
         return f"{last.removeprefix('error: ')} (see {self.folder / LOG})"
 
 
