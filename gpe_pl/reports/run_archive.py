@@ -1,7 +1,8 @@
 """Archive of many runs: two small files from which tables can be made again after the folders of the runs are deleted.
 
 ``runs.json`` has the configurations and validation curves. ``rollouts.csv.xz`` has one line per run, model, split and trajectory, and one column per metric and
-horizon, such as ``rollout_mse@full``. Values have nine significant digits.
+horizon, such as ``rollout_mse@full``. Values have six significant digits; metrics
+of single-precision rollouts have no more.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from gpe_pl.files import sealed
 from gpe_pl.files.atomic import replacing
 
 RUNS, ROLLOUTS = "runs.json", "rollouts.csv.xz"
-NUMBER = "{:.9g}"
+NUMBER = "{:.6g}"
 KEYS = ["model", "split", "trajectory", "parameter_group", "parameter"]
 COLUMNS = [*KEYS, "metric", "horizon", "value"]
 """Columns of a run's rows, as in ``metrics.csv``."""
@@ -55,7 +56,7 @@ def write_archive(folder: Path, runs: dict[str, dict[str, Any]], rows: dict[str,
 
 
 def read_archive(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, pd.DataFrame]]:
-    """Read an archive. Returns the arguments ``runs`` and ``rows`` of ``write_archive``, with values to nine digits.
+    """Read an archive. Returns the arguments ``runs`` and ``rows`` of ``write_archive``, with values to six digits.
 
     Raises:
         ArchiveError: a file is damaged or does not belong to the other.
