@@ -287,7 +287,7 @@ def crowding(pos: np.ndarray, width: float) -> np.ndarray:
 def unsound(state: State, metadata: Metadata) -> Termination | None:
     """Return the reason why a rollout cannot start: the first array or shape of the initial state that breaks its rule. Return None if there is none.
 
-    The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``. Gravity, velocity history and velocities at the frame must be finite.
+    The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``. Gravity, velocity history and velocities at the frame must have their shapes and be finite.
     """
     b, has_mesh = state.boundary, state.cells is not None and state.rest_pos is not None
     nodes = {
@@ -309,9 +309,15 @@ def unsound(state: State, metadata: Metadata) -> Termination | None:
         for fault in faults(arrays, NODE_TYPES, metadata.materials, metadata.param_names):
             reason = {"pos": "nan", "vel": "nan", "material_params": "material"}.get(fault.field, "input")
             return Termination(reason, 0, fault.index("node"), str(fault))
-    for name in ("gravity", "velocity_history", "frame_velocity"):
+    num_nodes, dim = len(state.pos), metadata.dim
+    for name, shape in {"gravity": (dim,), "velocity_history": (num_nodes, -1, dim), "frame_velocity": (num_nodes, dim)}.items():
         values = getattr(state, name)
-        if values is not None and not np.isfinite(as_numpy(values)).all():
+        if values is None:
+            continue
+        if values.ndim != len(shape) or any(size not in (-1, found) for size, found in zip(shape, values.shape, strict=True)):
+            wanted = ", ".join("any" if size == -1 else str(size) for size in shape)
+            return Termination("input", 0, -1, f"{name} has the shape {tuple(values.shape)}, must be ({wanted})")
+        if not np.isfinite(as_numpy(values)).all():
             return Termination("nan", 0, -1, f"{name} is not finite")
     if (wrong := shapes_fault(b.shapes, metadata.periodicity)) is not None:
         return Termination("input", 0, -1, wrong)

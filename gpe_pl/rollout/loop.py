@@ -169,6 +169,8 @@ def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int,
     """
     live, num_steps, guards = dict[int, State](), dict[int, int](), dict[int, Guard]()
     for scene, start in enumerate(starts):
+        if start.num_steps < 0:
+            raise ValueError(f"num_steps={start.num_steps}: must be at least 0")
         guard = None if start.guard is None else start.guard.of(start.state)
         impossible = (
             unfit(simulator, start.metadata)

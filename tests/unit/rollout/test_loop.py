@@ -370,3 +370,17 @@ def test_fraction_outside(trajectory: Trajectory) -> None:
     assert fraction_outside(moved) == pytest.approx(3 / 72)
     assert fraction_outside(moved, tolerance=0.06) == 0.0
     assert fraction_outside(replace(moved, boundary=replace(moved.boundary, shapes=()))) == 0.0
+
+
+@pytest.mark.parametrize("name", ["gravity", "velocity_history", "frame_velocity"])
+def test_a_start_whose_array_has_another_shape_is_refused(trajectory: Trajectory, name: str) -> None:
+    state = replace(trajectory.state(0), velocity_history=trajectory.vel[0][:, None], frame_velocity=trajectory.vel[0])
+    assert rollout(FreeFall(0.01), state, 1, trajectory.metadata).termination is None
+    short = replace(state, **{name: getattr(state, name)[:-1]})
+    stopped = rollout(FreeFall(0.01), short, 1, trajectory.metadata).termination
+    assert stopped is not None and stopped.message.startswith(f"{name} has the shape (")
+
+
+def test_a_negative_number_of_steps_is_refused(trajectory: Trajectory) -> None:
+    with pytest.raises(ValueError, match="num_steps=-1: must be at least 0"):
+        rollout(FreeFall(0.01), trajectory.state(0), -1, trajectory.metadata)
