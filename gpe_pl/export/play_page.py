@@ -1,6 +1,6 @@
 """The page to play with: a folder that any file server can serve, in which a learned model runs in the browser.
 
-The folder needs neither Python nor a network. It contains ``index.html``, ``play.css``, ``play.js`` and a file per model. The parts are in ``play/``: modules
+The folder needs neither Python nor a network. It contains ``index.html``, ``play.css``, ``play.js`` and a file per model, ``model_0.js`` and so on. The parts are in ``play/``: modules
 that Node runs as they are, and that ``bundled`` joins into one script, so that the page also opens from a disk. The network runs in WebAssembly that the script
 writes itself (``play/kernels.mjs``), so no binary is shipped.
 """
@@ -22,7 +22,6 @@ from gpe_pl.errors import GpeError
 from gpe_pl.export.play_model import PageError, model_for_page
 from gpe_pl.export.play_scene import check_boundary, state_for_page
 from gpe_pl.files.atomic import replace_text
-from gpe_pl.files.names import portable
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
@@ -34,7 +33,7 @@ LEVELS = 65535
 
 
 class PageFolderError(GpeError, ValueError):
-    """Raised when a page has no model, or when two models have the same name."""
+    """Raised when a page has no model."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +68,14 @@ def write_page(
         raise PageFolderError("a page needs at least one model")
     folder = Path(folder)
     texts = {"play.js": bundled(), "play.css": (PARTS / "play.css").read_text(encoding="utf-8")}
-    for name, simulator in simulators.items():
-        texts[f"{portable(name)}.js"] = _model_script(name, simulator, (films or {}).get(name, ()))
-    scripts = "\n".join(f'<script src="{html.escape(portable(name))}.js"></script>' for name in simulators)
-    parts = {"materials": html.escape(", ".join(simulators)), "models": scripts}
+    scripts = [f"model_{number}.js" for number in range(len(simulators))]  # of a model's name a browser may make another address
+    for script, (name, simulator) in zip(scripts, simulators.items(), strict=True):
+        texts[script] = _model_script(name, simulator, (films or {}).get(name, ()))
+    materials = dict.fromkeys(simulator.builder.spec.materials[0] for simulator in simulators.values())
+    parts = {
+        "materials": html.escape(", ".join(materials)),
+        "models": "\n".join(f'<script src="{script}"></script>' for script in scripts),
+    }
     page = (PARTS / "index.html").read_text(encoding="utf-8")
     texts["index.html"] = re.sub(r"\{\{(\w+)\}\}", lambda slot: parts[slot[1]], page)
     for name, text in texts.items():

@@ -222,8 +222,8 @@ def test_a_page_is_exported_with_films_of_the_solver(tiny_data: Path, tmp_path: 
     simulator.save(tmp_path / "own.ckpt")
     evaluate(tiny_data, tmp_path, tmp_path / "own.ckpt", "evaluation.num_pictures=2", "evaluation.export=[page]")
     folder = tmp_path / "evaluation_test_unseen" / "page"
-    assert {path.name for path in folder.iterdir()} == {"index.html", "play.css", "play.js", "learned.js"}
-    assert (folder / "learned.js").read_text().count('"numFrames"') == 2
+    assert {path.name for path in folder.iterdir()} == {"index.html", "play.css", "play.js", "model_0.js"}
+    assert (folder / "model_0.js").read_text().count('"numFrames"') == 2
 
 
 def test_a_page_of_another_model_is_refused_before_the_rollouts(tiny_data: Path, tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def test_blocks_fall_when_the_page_plays(page: Any) -> None:
     page.wait_for_function("gpePage.world.time > 0.05")
     page.locator("#play").click()
     assert (nodes(page)[:, 1] < before[:, 1]).all()
-    page.wait_for_function("document.getElementById('kinetic').textContent !== '0.0 J'")
+    page.wait_for_function("document.getElementById('kinetic').textContent !== '0 J'")
 
 
 @pytest.mark.parametrize("page", [{}, PHONE], indirect=True, ids=["desktop", "phone"])
@@ -166,6 +166,55 @@ def test_a_failed_model_stops_with_a_message(page: Any) -> None:
     page.evaluate("gpePage.world.state.vel[0] = NaN")
     advance(page, 2)
     assert "failed" in page.locator("#status").inner_text()
+    page.locator("#reset").click()
+    advance(page, 1)
+    assert "failed" not in page.locator("#status").inner_text()
+
+
+def test_the_canvas_fits_a_phone_on_its_side(browser: Any, address: str) -> None:
+    context = browser.new_context(viewport={"width": 740, "height": 340}, has_touch=True, is_mobile=True)
+    opened = context.new_page()
+    opened.goto(address)
+    opened.wait_for_function("window.gpePage")
+    box = opened.locator("#stage").bounding_box()
+    assert box["height"] < 340 and box["width"] < 740
+    context.close()
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_a_scene_follows_the_size_of_the_domain(browser: Any, tmp_path: Path, factor: float) -> None:
+    """A model of a box of 10 cm or 10 m: the same scene, smaller or larger."""
+    simulator = LearnedSimulator.from_checkpoint("sand")
+    path = write_page(tmp_path, {"sand": simulator})
+    opened = browser.new_page(reduced_motion="reduce")
+    opened.goto(path.as_uri())
+    opened.wait_for_function("window.gpePage")
+    before, obstacle = nodes(opened), opened.evaluate("gpePage.world.obstacles[0]")
+    scaled = """factor => { const model = gpeModels[0]; model.spacing *= factor; model.bounds = model.bounds.map(a => a.map(v => v * factor)); gpePage.open(0); }"""
+    opened.evaluate(scaled, factor)
+    after = opened.evaluate("gpePage.world.obstacles[0]")
+    np.testing.assert_allclose(nodes(opened)[:, :2], factor * before[:, :2], rtol=1e-9)
+    np.testing.assert_allclose([*after["center"], after["radius"]], factor * np.array([*obstacle["center"], obstacle["radius"]]))
+    opened.close()
+
+
+@pytest.mark.parametrize("name", ["play", "a#1", "50%25", "<b>"])
+def test_a_model_may_have_any_name(browser: Any, tmp_path: Path, name: str) -> None:
+    opened = browser.new_page(reduced_motion="reduce")
+    opened.goto(write_page(tmp_path, {name: LearnedSimulator.from_checkpoint("sand")}).as_uri())
+    opened.wait_for_function("window.gpePage")
+    assert opened.evaluate("gpeModels[0].name") == name
+    assert opened.title() == "Play with learned sand"
+    opened.close()
+
+
+def test_a_page_without_its_model_says_so(browser: Any, tmp_path: Path) -> None:
+    path = write_page(tmp_path, {"sand": LearnedSimulator.from_checkpoint("sand")})
+    (tmp_path / "model_0.js").unlink()
+    opened = browser.new_page()
+    opened.goto(path.as_uri())
+    assert "model_0.js" in opened.locator("#status").inner_text()
+    opened.close()
 
 
 def test_the_script_names_every_part() -> None:
@@ -183,13 +232,13 @@ def test_the_command_writes_a_folder(tmp_path: Path, capsys: pytest.CaptureFixtu
     monkeypatch.setattr("sys.argv", ["gpe play", "snow", f"folder={tmp_path}"])
     play.main()
     assert capsys.readouterr().out.strip() == str(tmp_path / "index.html")
-    assert '<script src="snow.js">' in (tmp_path / "index.html").read_text()
+    assert '<script src="model_0.js">' in (tmp_path / "index.html").read_text()
 
 
 @pytest.mark.slow
 def test_the_command_films_the_solver(tmp_path: Path) -> None:
     play.write(tmp_path, ["snow"], 1)
-    about = json.loads((tmp_path / "snow.js").read_text().partition("push(")[2].rpartition(")")[0])
+    about = json.loads((tmp_path / "model_0.js").read_text().partition("push(")[2].rpartition(")")[0])
     (scene,) = about["scenes"]
     assert scene["numFrames"] == play.NUM_FRAMES + 1
     film = np.frombuffer(base64.b64decode(scene["film"]), "<u2").reshape(scene["numFrames"], scene["count"], 2)

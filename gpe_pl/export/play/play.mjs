@@ -1,10 +1,10 @@
 // The page: pointer, keyboard, sliders and readings.
 
-import { Panel, EnergyPlot, colorsOf } from "./view.mjs";
+import { EnergyPlot, Panel, TOP_SPEED, colorsOf } from "./view.mjs";
 import { World } from "./world.mjs";
 
 const BUDGET = 14; // time for steps between two pictures [ms]
-const CURSOR_STEP = 0.02; // of an arrow key [m]
+const CURSOR_STEP = 0.02; // of an arrow key [m], in a domain of 1 m
 const READINGS_EVERY = 200; // [ms]
 
 const $ = (id) => document.getElementById(id);
@@ -14,6 +14,9 @@ function decoded(text, Kind) {
   const bytes = atob(text);
   return new Kind(Uint8Array.from(bytes, (letter) => letter.charCodeAt(0)).buffer);
 }
+
+/** Return a number with three digits. */
+const short = (value) => (Math.abs(value) >= 100 || value === 0 ? value.toFixed(0) : value.toPrecision(3));
 
 class Page {
   constructor(models) {
@@ -43,6 +46,8 @@ class Page {
     $("scene-row").hidden = !model.scenes.length;
     $("material").textContent = model.material;
     $("parameters").replaceChildren(...model.parameters.map((parameter, k) => this.slider(parameter, k)));
+    $("speed-range").textContent = `speed, 0 to ${short(TOP_SPEED * this.world.pace)} m/s`;
+    this.showSide();
     $("ranges").replaceChildren(...Object.entries(model.trained).map(([name, range]) => {
       const item = document.createElement("li");
       item.textContent = `${name}: ${range}`;
@@ -62,6 +67,7 @@ class Page {
     this.plot.clear();
     this.cursor = null;
     this.behind = 0;
+    this.say("");
   }
 
   slider(parameter, k) {
@@ -89,6 +95,15 @@ class Page {
     $(`value-${k}`).textContent = text;
   }
 
+  /** The side of new blocks [m]; the slider has fractions of the domain. */
+  get side() {
+    return Number($("size").value) * this.world.unit;
+  }
+
+  showSide() {
+    $("side").textContent = `${short(this.side)} m`;
+  }
+
   // --- time ------------------------------------------------------------------------------------------------------------------------------------
 
   frame(now) {
@@ -112,7 +127,7 @@ class Page {
     const start = performance.now();
     if (!this.world.step()) {
       this.play(false);
-      this.say(`${this.world.problem} Press R to start again.`);
+      this.say(`${this.world.problem} Restart (R) starts again.`);
       return;
     }
     this.counts.cost += performance.now() - start;
@@ -136,7 +151,7 @@ class Page {
     this.film.draw({ shapes: choice.shapes, pos, count: choice.count, spacing: model.spacing, colorOf: () => "#1f77b4" });
     $("film-note").textContent = world.untouched
       ? frame === choice.numFrames - 1 ? "the film has ended" : ""
-      : "the film shows the scene as it was at the start; press R to compare again";
+      : "the film shows the scene as it was at the start; Restart (R) compares again";
   }
 
   readings(now) {
@@ -146,9 +161,9 @@ class Page {
     $("rate").textContent = this.playing ? `${rate.toFixed(0)} /s (${(rate * this.model.frameDt).toFixed(2)} × real time)` : "paused";
     $("cost").textContent = counts.steps ? `${(counts.cost / counts.steps).toFixed(1)} ms` : "–";
     $("nodes").textContent = `${world.state.count} particles, ${world.last.edges} edges`;
-    $("kinetic").textContent = `${kinetic.toFixed(1)} J`;
-    $("potential").textContent = `${potential.toFixed(1)} J`;
-    $("fastest").textContent = `${fastest.toFixed(2)} m/s`;
+    $("kinetic").textContent = `${short(kinetic)} J`;
+    $("potential").textContent = `${short(potential)} J`;
+    $("fastest").textContent = `${short(fastest)} m/s`;
     this.counts = { steps: 0, since: now, cost: 0 };
   }
 
@@ -174,11 +189,11 @@ class Page {
   release() {
     if (!this.world.hand) return;
     const speed = this.world.release();
-    this.say(speed ? `Thrown at ${speed.toFixed(1)} m/s.` : "Released.");
+    this.say(speed ? `Thrown at ${short(speed)} m/s.` : "Released.");
   }
 
   addBlock([x, y]) {
-    const count = this.world.addBlock(x, y, Number($("size").value));
+    const count = this.world.addBlock(x, y, this.side);
     this.say(count ? `Added a block of ${count} particles.` : "No room for a block there.");
   }
 
@@ -210,12 +225,14 @@ class Page {
     for (const [id, action] of Object.entries(buttons)) $(id).addEventListener("click", action);
     $("model").addEventListener("change", () => this.open(Number($("model").value)));
     $("scene").addEventListener("change", () => this.restart());
+    $("size").addEventListener("input", () => this.showSide());
     stage.addEventListener("pointerdown", (event) => {
       const [x, y] = this.panel.pointAt(event);
       this.cursor = null;
       if (this.grab(x, y)) {
         stage.setPointerCapture(event.pointerId);
         event.preventDefault();
+        stage.focus({ preventScroll: true }); // so that keys work
       }
     });
     stage.addEventListener("pointermove", (event) => this.world.hand && !this.cursor && this.world.point(...this.panel.pointAt(event)));
@@ -252,7 +269,7 @@ class Page {
       action();
       return;
     }
-    const reach = CURSOR_STEP * (event.shiftKey ? 4 : 1);
+    const reach = CURSOR_STEP * this.world.unit * (event.shiftKey ? 4 : 1);
     this.cursor = [
       Math.min(Math.max(at[0] + reach * moves[0], left), right),
       Math.min(Math.max(at[1] + reach * moves[1], bottom), top),
@@ -264,6 +281,10 @@ class Page {
 function start() {
   if (typeof WebAssembly === "undefined") {
     $("status").textContent = "This browser has no WebAssembly; take a current one.";
+    return;
+  }
+  if (!window.gpeModels) {
+    $("status").textContent = "A file of this page is missing: model_0.js, beside index.html. Copy the whole folder.";
     return;
   }
   window.gpePage = new Page(window.gpeModels);

@@ -2,7 +2,8 @@
 
 const BLOCKS = ["#c2571a", "#1f77b4", "#2a9d5c", "#8e5bb5", "#b8860b", "#d1495b"];
 const INK = "#222222", SOLID = "#8a8f98", HELD = "#f4b400", SAMPLES = 240;
-const SPEED_STOPS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], TOP_SPEED = 3; // [m/s]
+const SPEED_STOPS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
+export const TOP_SPEED = 3; // of the colours [m/s], in a domain of 1 m
 
 const speedColors = Array.from({ length: 32 }, (_, k) => {
   const place = (k / 31) * (SPEED_STOPS.length - 1), first = Math.min(Math.floor(place), SPEED_STOPS.length - 2), t = place - first;
@@ -70,7 +71,7 @@ export class Panel {
       c.fill(path);
     }
     if (cursor) {
-      const reach = 0.03 * scale, [px, py] = [x(cursor[0]), y(cursor[1])];
+      const reach = 0.03 * Math.min(right - left, top - bottom) * scale, [px, py] = [x(cursor[0]), y(cursor[1])];
       c.strokeStyle = INK;
       c.beginPath();
       c.arc(px, py, reach, 0, 2 * Math.PI);
@@ -84,13 +85,13 @@ export class Panel {
 }
 
 /** Return the function that gives the colour of a node: by block, or by speed. Nodes in the hand have a colour of their own. */
-export function colorsOf(by, { state, hand }) {
-  const held = hand && hand.mask;
+export function colorsOf(by, { state, hand, pace }) {
+  const held = hand && hand.mask, top = TOP_SPEED * pace;
   return (n) => {
     if (held && held[n]) return HELD;
     if (by === "block") return BLOCKS[state.block[n] % BLOCKS.length];
     const speed = Math.hypot(state.vel[2 * n], state.vel[2 * n + 1]);
-    return speedColors[Math.min(31, Math.floor((31 * speed) / TOP_SPEED))];
+    return speedColors[Math.min(31, Math.floor((31 * speed) / top))];
   };
 }
 

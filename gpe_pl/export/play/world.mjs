@@ -1,4 +1,6 @@
 // What is on the page: blocks of particles, walls and obstacles, and the hand that moves them.
+//
+// Lengths and speeds are those of a domain of 1 m. ``unit`` and ``pace`` of a world are its lengths and speeds over these.
 
 import { Simulator } from "./step.mjs";
 import { boundaryOf, distanceTo, nearest } from "./shapes.mjs";
@@ -7,6 +9,7 @@ export const REACH = 0.15; // of the hand [m]
 const SLOWEST_RELEASE = 0.02, FASTEST_HAND = 2.5, FASTEST_OBSTACLE = 0.6; // [m/s]
 const FOLLOWS_IN = 0.04; // time in which the hand follows the pointer [s]
 const MOST_NODES = 1500;
+const RADIUS = 0.09, NEAR = 0.05, MARGIN = 0.02; // of a new obstacle; of the node that is picked; of obstacles from walls [m]
 const JITTER = 0.25; // of new blocks [spacings]
 const EXPLODED = 50; // speed at which the model has failed [m/s]
 const OBSTACLE_FRICTION = 0.4;
@@ -18,6 +21,9 @@ export class World {
     this.model = model;
     this.simulator = new Simulator(model, numbers);
     this.parameters = model.parameters.map(({ low, high }) => (low + high) / 2);
+    const [[left, right], [bottom, top]] = model.bounds;
+    this.unit = Math.min(right - left, top - bottom);
+    this.pace = Math.sqrt((this.unit * (Math.hypot(...model.gravity) || 9.81)) / 9.81); // of what falls through the domain
     this.reset();
   }
 
@@ -36,9 +42,10 @@ export class World {
       this.parameters = scene.params.slice(0, model.parameters.length);
     } else {
       this.shapes = boxWalls(model.bounds);
-      this.addObstacle(0.66, 0.24);
-      this.addBlock(0.25, 0.35, 0.22);
-      this.addBlock(0.6, 0.68, 0.18);
+      const [[left, right], [bottom, top]] = model.bounds, at = (x, y) => [left + x * (right - left), bottom + y * (top - bottom)];
+      this.addObstacle(...at(0.66, 0.24));
+      this.addBlock(...at(0.25, 0.35), 0.22 * this.unit);
+      this.addBlock(...at(0.6, 0.68), 0.18 * this.unit);
     }
     this.resample();
   }
@@ -107,9 +114,9 @@ export class World {
     return count;
   }
 
-  addObstacle(x, y, radius = 0.09) {
-    const [[left, right], [bottom, top]] = this.model.bounds, gap = radius + 2 * this.model.spacing;
-    const center = [Math.min(Math.max(x, left + gap), right - gap), Math.min(Math.max(y, bottom + gap), top - gap)];
+  addObstacle(x, y) {
+    const radius = RADIUS * this.unit, gap = radius + 2 * this.model.spacing;
+    const center = this.model.bounds.map(([low, high], a) => clamped([x, y][a], low + gap, high - gap));
     this.shapes = [...this.shapes, { kind: "sphere", center, radius, friction: OBSTACLE_FRICTION, restitution: 0 }];
     this.untouched = false;
     this.resample();
@@ -135,9 +142,9 @@ export class World {
     return this.obstacles.find((shape) => distanceTo(shape, x, y) < 0) || null;
   }
 
-  nodeAt(x, y, reach = 0.05) {
+  nodeAt(x, y) {
     const { state } = this;
-    let found = -1, least = reach;
+    let found = -1, least = NEAR * this.unit;
     for (let n = 0; n < state.count; n++) {
       const d = Math.hypot(state.pos[2 * n] - x, state.pos[2 * n + 1] - y);
       if (d < least) [found, least] = [n, d];
@@ -159,7 +166,7 @@ export class World {
     if (node < 0) return "";
     const mask = new Uint8Array(state.count);
     for (let n = 0; n < state.count; n++) {
-      mask[n] = state.block[n] === state.block[node] && Math.hypot(state.pos[2 * n] - x, state.pos[2 * n + 1] - y) < REACH;
+      mask[n] = state.block[n] === state.block[node] && Math.hypot(state.pos[2 * n] - x, state.pos[2 * n + 1] - y) < REACH * this.unit;
     }
     this.hand = { ...hand, mask };
     return "block";
@@ -175,7 +182,7 @@ export class World {
     this.hand = null;
     if (!hand || !hand.mask) return 0;
     const speed = Math.hypot(...hand.velocity);
-    return speed < SLOWEST_RELEASE ? 0 : speed;
+    return speed < SLOWEST_RELEASE * this.pace ? 0 : speed;
   }
 
   /** Return how far the hand moves in a step [m]. */
@@ -188,9 +195,9 @@ export class World {
   }
 
   moveObstacle() {
-    const { obstacle, at } = this.hand, move = this.handMove(FASTEST_OBSTACLE), [bx, by] = this.model.bounds;
+    const { obstacle, at } = this.hand, move = this.handMove(FASTEST_OBSTACLE * this.pace), margin = MARGIN * this.unit;
     const moved = translated(obstacle, move);
-    const inside = [bx, by].every(([low, high], a) => center(moved)[a] > low + 0.02 && center(moved)[a] < high - 0.02);
+    const inside = this.model.bounds.every(([low, high], a) => center(moved)[a] > low + margin && center(moved)[a] < high - margin);
     if (!inside) return;
     this.shapes = this.shapes.map((shape) => (shape === obstacle ? moved : shape));
     this.hand.obstacle = moved;
@@ -208,14 +215,14 @@ export class World {
       this.untouched = false;
       if (this.hand.obstacle) this.moveObstacle();
       else {
-        held = { mask: this.hand.mask, move: this.handMove(FASTEST_HAND) };
+        held = { mask: this.hand.mask, move: this.handMove(FASTEST_HAND * this.pace) };
         this.hand.at = this.hand.at.map((value, a) => value + held.move[a]);
       }
     }
     if (this.state.count) this.last = this.simulator.step(this.state, this.boundary, this.shapes, held);
     this.time += this.model.frameDt;
     for (const v of this.state.vel) {
-      if (!(Math.abs(v) < EXPLODED)) {
+      if (!(Math.abs(v) < EXPLODED * this.pace)) {
         this.problem = Number.isFinite(v) ? "The model has failed: particles fly apart." : "The model has failed: a velocity is not a number.";
         return false;
       }
@@ -235,6 +242,11 @@ export class World {
     }
     return { kinetic, potential, fastest: Math.sqrt(fastest) };
   }
+}
+
+/** Return the value between two limits that is nearest to a value; the middle if there is none between them. */
+function clamped(value, low, high) {
+  return low > high ? (low + high) / 2 : Math.min(Math.max(value, low), high);
 }
 
 export function center(shape) {
