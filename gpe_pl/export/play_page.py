@@ -1,8 +1,8 @@
 """The page to play with: a folder that any file server can serve, in which a learned model runs in the browser.
 
-The folder needs neither Python nor a network. It contains ``index.html``, ``play.css``, ``play.js`` and a file per model, ``model_0.js`` and so on. The parts are in ``play/``: modules
-that Node runs as they are, and that ``bundled`` joins into one script, so that the page also opens from a disk. The network runs in WebAssembly that the script
-writes itself (``play/kernels.mjs``), so no binary is shipped.
+The folder needs neither Python nor a network. It contains ``index.html``, ``play.css``, ``play.js`` and a file per model, ``model_0.js`` and so on. The parts
+are in ``play/``: modules that Node runs as they are, and that ``bundled`` joins into one script, so that the page also opens from a disk. The network runs in
+WebAssembly that the script writes itself (``play/kernels.mjs``), so no binary is shipped.
 """
 
 from __future__ import annotations

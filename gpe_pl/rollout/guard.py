@@ -287,7 +287,8 @@ def crowding(pos: np.ndarray, width: float) -> np.ndarray:
 def unsound(state: State, metadata: Metadata) -> Termination | None:
     """Return the reason why a rollout cannot start: the first array or shape of the initial state that breaks its rule. Return None if there is none.
 
-    The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``. Gravity, velocity history and velocities at the frame must have their shapes and be finite.
+    The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``. Gravity, velocity history and velocities at the frame must have their shapes and
+    be finite.
     """
     b, has_mesh = state.boundary, state.cells is not None and state.rest_pos is not None
     nodes = {

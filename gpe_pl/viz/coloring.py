@@ -122,8 +122,13 @@ class Coloring:
     def bar_label(self) -> str | None:
         """Label of the colour bar, or None if the colours need no bar."""
         if self.by == "error" and self._truth is not None and self._truth.is_prediction:
-            return "distance from the first row [m]"
+            return "distance from the first rollout [m]"
         return BAR_LABELS.get(self.by)
+
+    @property
+    def explanation(self) -> str:
+        """What colours mean, if they need neither a bar nor a legend; otherwise empty."""
+        return "colour: height at the start" if self.by == "height" else ""
 
     def values(self, trajectory: Trajectory, frame: int) -> tuple[Float[np.ndarray, "node"], Float[np.ndarray, "cell"]]:
         """Return the values that colour nodes and mesh cells; NaN where there is none."""

@@ -1,8 +1,8 @@
 """The layout of trajectory figures: one row per trajectory, time to the right."""
 
 import textwrap
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -67,9 +67,7 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
     aspect = Camera(trajectories[0]).aspect
     with_bar = 0.74 if coloring.by == "error" else 0.9  # inch; errors have up to six characters, stresses include the unit
     right = with_bar if has_bar else 0.04
-    caption = textwrap.fill(
-        "; ".join([in_common(trajectories), *["colour: height at the start"] * (coloring.by == "height")]), int(TEXT_WIDTH / CHARACTER)
-    )
+    caption = textwrap.fill("; ".join(filter(None, [in_common(trajectories), coloring.explanation])), int(TEXT_WIDTH / CHARACTER))
     below = 0.24 if legend else 0.06
     top, bottom, gap = 0.22, below + LINE * (caption.count("\n") + 1) + 0.04, 0.05
 
@@ -110,26 +108,41 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
     if has_bar:
         rows_beside = len(rows) - first_with_bar
         tall = max(LOWEST_BAR, rows_beside * row_height + (rows_beside - 1) * gap)
-        _draw_bar(figure, coloring, bar_label, (1 - (right - 0.1) / TEXT_WIDTH, (bottom + gap) / height, 0.08 / TEXT_WIDTH, tall / height))
+        draw_bar(figure, coloring, bar_label, (1 - (right - 0.1) / TEXT_WIDTH, (bottom + gap) / height, 0.08 / TEXT_WIDTH, tall / height))
     if legend:
-        handles = [Line2D([], [], linestyle="", marker="o", markersize=5, color=color, label=name) for name, color in legend.items()]
-        figure.legend(
-            handles=handles,
-            loc="lower center",
-            ncols=len(handles),
-            frameon=False,
-            fontsize=8,
-            labelcolor=INK,
-            borderpad=0.2,
-            handletextpad=0.1,
-        )
+        draw_legend(figure, legend, 0.0)
     return figure
 
 
-def _draw_bar(figure: Figure, coloring: Coloring, label: str, rectangle: tuple[float, float, float, float]) -> None:
+def draw_legend(figure: Figure, legend: Mapping[str, Any], bottom: float) -> None:
+    """Draw a line with the colour of each material. ``bottom`` is its lower edge, as a fraction of the figure."""
+    handles = [Line2D([], [], linestyle="", marker="o", markersize=5, color=color, label=name) for name, color in legend.items()]
+    figure.legend(
+        handles=handles,
+        loc="lower center",
+        bbox_to_anchor=(0.5, bottom),
+        ncols=len(handles),
+        frameon=False,
+        fontsize=8,
+        labelcolor=INK,
+        borderpad=0.2,
+        handletextpad=0.1,
+    )
+
+
+def draw_bar(
+    figure: Figure,
+    coloring: Coloring,
+    label: str,
+    rectangle: tuple[float, float, float, float],
+    orientation: Literal["vertical", "horizontal"] = "vertical",
+) -> None:
+    """Draw the scale of the colours into a rectangle [left, bottom, width, height], as fractions of the figure."""
     formatter = EngFormatter(unit="Pa") if coloring.by == "von_mises" else None
     axes = figure.add_axes(rectangle)
-    bar = figure.colorbar(ScalarMappable(coloring.scale, coloring.color_map), cax=axes, extend="max", format=formatter)
+    bar = figure.colorbar(
+        ScalarMappable(coloring.scale, coloring.color_map), cax=axes, extend="max", format=formatter, orientation=orientation
+    )
     bar.set_label(label, fontsize=7, color=INK)
     bar.ax.tick_params(labelsize=6.5, width=0.5, length=2)
     bar.outline.set_linewidth(0.5)

@@ -17,7 +17,7 @@ from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
 from gpe_pl.viz.captions import frame_time, in_common, pictured
 from gpe_pl.viz.coloring import COLOR_MAPS, REFERENCE, ColorBy, Coloring
-from gpe_pl.viz.film_strip import evenly_spaced_frames
+from gpe_pl.viz.film_strip import draw_bar, draw_legend, evenly_spaced_frames
 from gpe_pl.viz.panel import HAZE, Panel
 from gpe_pl.viz.scenery import INK
 
@@ -25,6 +25,8 @@ PANEL_PIXELS, FILM_PIXELS = 360, 960
 CHARACTER_PIXELS = 7
 """Approximate width of a character of the line that names materials, in pixels."""
 DPI = 100
+BAR_PIXELS, BAR_WIDTH = 44, 240
+"""Height of the scale of colours with its numbers and label, and width of the scale, in pixels."""
 
 SAMPLES = 8
 """Number of frames whose colours determine the palette of a GIF."""
@@ -103,8 +105,12 @@ def _images(rows: dict[str, Trajectory], frames: Sequence[int], coloring: Colori
     aspect = Camera(first).aspect
 
     line, gap = 24, 8
-    caption = textwrap.wrap(in_common(list(rows.values())), int((len(rows) * panel_pixels) / CHARACTER_PIXELS))
-    title = line * (1 + len(caption))
+    words = [*filter(None, [in_common(list(rows.values())), coloring.explanation])]
+    characters = int(len(rows) * panel_pixels / CHARACTER_PIXELS)
+    caption = [text] if len(text := "; ".join(words)) <= characters else [part for word in words for part in textwrap.wrap(word, characters)]
+    legend = coloring.legend(rows.values())
+    key = BAR_PIXELS if coloring.bar_label else line if legend else 0
+    title = line * (1 + len(caption)) + key
     width = len(rows) * panel_pixels + (len(rows) + 1) * gap
     height = round(panel_pixels * aspect) + title + gap
     width, height = width + width % 2, height + height % 2  # H.264 needs even sizes
@@ -118,6 +124,12 @@ def _images(rows: dict[str, Trajectory], frames: Sequence[int], coloring: Colori
         figure.text((left + panel_pixels / 2) / width, 1 - line / 2 / height, name, ha="center", va="center", fontsize=10, color=INK)
     for k, text in enumerate(caption):
         figure.text(0.5, 1 - line * (1.5 + k) / height, text, ha="center", va="center", fontsize=9, color=INK)
+    if coloring.bar_label:
+        wide = min(BAR_WIDTH, width - 2 * gap)
+        box = ((width - wide) / 2 / width, 1 - (title - key + 8) / height, wide / width, 8 / height)
+        draw_bar(figure, coloring, coloring.bar_label, box, "horizontal")
+    elif legend:
+        draw_legend(figure, legend, 1 - title / height)
     clock = figure.text(gap / width, 1 - line / 2 / height, "", ha="left", va="center", fontsize=9, color=INK)
 
     moving = [*(artist for panel in panels for artist in panel.artists), clock]

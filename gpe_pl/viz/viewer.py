@@ -30,7 +30,7 @@ from gpe_pl.geometry.shapes import Bowl, signed_distance
 from gpe_pl.schema import BOUNDARY, NODE_TYPES, node_code
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import AZIMUTH, ELEVATION, vertical_axis
-from gpe_pl.viz.captions import describe, frame_time, heading, hidden_nodes, pictured, time_decimals, with_heading
+from gpe_pl.viz.captions import frame_time, heading, hidden_nodes, in_common, pictured, time_decimals, with_heading
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error
 from gpe_pl.viz.contact_sheet import informative_color
 from gpe_pl.viz.panel import DOT, drawn_faces, outline, polygon_edges
@@ -45,7 +45,6 @@ FASTEST = 50.0
 """Largest stored speed or stress, as a multiple of the end of its colour scale, so that an exploded value does not use up all levels."""
 
 UNITS: dict[ColorBy, tuple[str, str]] = {
-    "error": ("position error", "m"),
     "height": ("height at the start", "m"),
     "material": ("material", ""),
     "speed": ("speed", "m/s"),
@@ -114,7 +113,8 @@ def viewer_page(
     parts = {
         "title": html.escape(title),
         "contents": html.escape(", ".join(trajectories)),
-        "materials": html.escape(describe(ground_truth)),
+        "materials": html.escape(in_common([*trajectories.values()])),
+        "apart": scene["apart"]["name"],
         "style": (PAGE / "viewer.css").read_text(encoding="utf-8"),
         "arrays": "\n".join(_element(name, *value) for name, value in arrays.items()),
         "scene": json.dumps(scene, allow_nan=False).replace("<", "\\u003c"),
@@ -139,6 +139,11 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
     steps = {by: _step(by, colorings[by], shown, frames) for by in ("speed", "von_mises") if by in colorings}
     codes = np.unique(truth.node_type).tolist()
     vertical = vertical_axis(truth)
+    apart = (
+        {"title": "distance", "name": "distance from the first rollout"}
+        if truth.is_prediction
+        else {"title": "error", "name": "position error"}
+    )
     scene = {
         "dim": about.dim,
         "nodes": truth.num_nodes,
@@ -156,7 +161,8 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
         "neutral": to_rgb(REFERENCE),
         "materials": [{"name": NODE_TYPES[code], "color": MATERIAL_COLORS.get(NODE_TYPES[code], REFERENCE)} for code in codes],
         "nodeMaterials": list(NODE_TYPES),
-        "colors": [_color(by, coloring) for by, coloring in colorings.items()],
+        "colors": [_color(by, coloring, apart["name"]) for by, coloring in colorings.items()],
+        "apart": apart,
         "steps": steps,
         "trajectories": [],
         **_focus(truth),
@@ -262,8 +268,9 @@ def _rmse(prediction: Trajectory, truth: Trajectory, frames: Sequence[int]) -> l
     return [float(np.sqrt(np.mean(error**2))) if len(error) else None for error in known]
 
 
-def _color(by: ColorBy, coloring: Coloring) -> dict[str, Any]:
-    name, unit = UNITS[by]
+def _color(by: ColorBy, coloring: Coloring, apart: str) -> dict[str, Any]:
+    """Return the name and scale of a colouring; ``apart`` names the distance between two trajectories."""
+    name, unit = UNITS.get(by, (apart, "m"))
     low, high = coloring.scale.vmin, coloring.scale.vmax
     return {"by": by, "name": name, "label": name, "unit": unit, "low": low, "high": high, "isExceeded": coloring.is_exceeded}
 

@@ -190,8 +190,8 @@ def test_a_scene_follows_the_size_of_the_domain(browser: Any, tmp_path: Path, fa
     opened.goto(path.as_uri())
     opened.wait_for_function("window.gpePage")
     before, obstacle = nodes(opened), opened.evaluate("gpePage.world.obstacles[0]")
-    scaled = """factor => { const model = gpeModels[0]; model.spacing *= factor; model.bounds = model.bounds.map(a => a.map(v => v * factor)); gpePage.open(0); }"""
-    opened.evaluate(scaled, factor)
+    scale = "model.spacing *= factor; model.bounds = model.bounds.map(axis => axis.map(value => value * factor));"
+    opened.evaluate(f"factor => {{ const model = gpeModels[0]; {scale} gpePage.open(0); }}", factor)
     after = opened.evaluate("gpePage.world.obstacles[0]")
     np.testing.assert_allclose(nodes(opened)[:, :2], factor * before[:, :2], rtol=1e-9)
     np.testing.assert_allclose([*after["center"], after["radius"]], factor * np.array([*obstacle["center"], obstacle["radius"]]))

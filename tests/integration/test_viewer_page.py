@@ -195,3 +195,25 @@ def test_the_mouse_finds_a_node_in_every_panel_and_turns_a_scene(opened: Any) ->
 @pytest.fixture(params=[2, 3], ids=["2d", "3d"])
 def mesh(request: pytest.FixtureRequest) -> Trajectory:
     return falling_mesh(request.param)
+
+
+def test_two_predictions_are_a_distance_apart(opened: Any) -> None:
+    truth, other = falling(2), falling(2, noise=0.3)
+    first, second = replace(truth, is_prediction=True), replace(other, is_prediction=True, material_params=truth.material_params + 10)
+    viewer = opened(first, steep=second)
+    assert viewer.page.locator("h2").all_inner_texts() == ["prediction", "steep", "distance"]
+    assert "distance from the first rollout" in viewer.page.locator(".bar").last.inner_text()
+    assert "distance" in viewer.page.locator("#time").inner_text()
+    assert viewer.page.locator("#materials").inner_text() == "sand"
+
+
+@pytest.mark.parametrize("width", [360, 414])
+def test_colour_bars_are_below_the_pictures_on_a_phone(opened: Any, width: int) -> None:
+    truth = falling(2)
+    viewer = opened(truth, GPE=falling(2, noise=0.3))
+    viewer.page.set_viewport_size({"width": width, "height": 700})
+    bars = viewer.page.evaluate("[...document.querySelectorAll('.panel')].map(p => [p.querySelector('.bar'), p])"
+        ".filter(([bar]) => bar).map(([bar, panel]) => [bar.offsetTop + bar.offsetHeight, bar.offsetTop, panel.clientHeight])")  # fmt: skip
+    assert len(bars) >= 2
+    for bottom, top, height in bars:
+        assert top >= height - 34 and bottom <= height

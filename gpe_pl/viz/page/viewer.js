@@ -137,7 +137,7 @@ class Viewer {
     const shown = [{ name: this.truth.name, of: this.truth, by: this.color }];
     if (this.prediction) {
       shown.push({ name: this.prediction.name, of: this.prediction, by: this.color });
-      shown.push({ name: "error", of: this.prediction, by: "error" });
+      shown.push({ name: scene.apart.title, of: this.prediction, by: "error" });
     }
     return shown;
   }
@@ -285,7 +285,7 @@ class Viewer {
     context.fillStyle = "#262626";
     context.fillRect(Math.min(canvas.width - 1, Math.max(0, x - 0.5)), 0, window.devicePixelRatio || 1, canvas.height);
     const error = this.prediction.rmse[this.frame];
-    $("time").textContent += error === null || error === undefined ? "" : `\nerror ${withUnit(error, "m")} rms`;
+    $("time").textContent += error === null || error === undefined ? "" : `\n${scene.apart.title} ${withUnit(error, "m")} rms`;
   }
 
   // --- controls ---------------------------------------------------------------------------------------------------------------------------

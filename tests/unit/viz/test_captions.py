@@ -95,10 +95,10 @@ def test_films_say_what_they_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(video, "Figure", Watched)
     write_animation(tmp_path / "a.gif", predicted(), {}, stride=6)
-    assert [*drawn] == ["prediction", SAND, ""]  # the last becomes the time
+    assert [*drawn] == ["prediction", SAND, "colour: height at the start", ""]  # the last becomes the time
     drawn.clear()
     write_film(tmp_path / "b.gif", "GPE", predicted())
-    assert [*drawn] == ["GPE", SAND, ""]
+    assert [*drawn] == ["GPE", f"{SAND}; colour: height at the start", ""]
 
 
 def test_contact_sheets_name_values_where_they_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,7 +145,7 @@ def test_a_stored_prediction_stays_one(tmp_path: Path) -> None:
 
 def test_a_distance_between_predictions_is_no_error() -> None:
     bars = [rollout_figure(first, {"other": predicted()}, color="error").axes[-1].get_ylabel() for first in (truth(), predicted())]
-    assert [" ".join(label.split("\n")) for label in bars] == ["position error [m]", "distance from the first row [m]"]
+    assert [" ".join(label.split("\n")) for label in bars] == ["position error [m]", "distance from the first rollout [m]"]
 
 
 @pytest.mark.parametrize(
