@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,6 +15,7 @@ from gpe_pl.config.entry_point import ConfigError, construct, entry_point
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+    from gpe_pl.evaluation.identification.results import Task
     from gpe_pl.trajectory.trajectory import Trajectory
 
 
@@ -79,11 +80,34 @@ def identify_scenes(cfg: DictConfig) -> None:
     with locked(folder), recorded(folder, "identify", sys.argv[1:], cfg.paths.runs):
         claim(folder, _identity(cfg, calibrated_on), results=["scenes/*"])
         with without_orphans(folder):
-            for name, trajectory in scenes(Path(settings.trajectory), settings.num_scenes):
-                for line in task.run(name, trajectory, folder):
-                    print(f"{name}: {line}", flush=True)
+            left_out = identify_all(task, scenes(Path(settings.trajectory), settings.num_scenes), folder)
             print(write_table(folder))
+            if left_out:
+                print(f"scenes that were left out: {len(left_out)}; the first is {left_out[0]}")
     print(folder)
+
+
+def identify_all(task: Task, named: Iterable[tuple[str, Trajectory]], folder: Path) -> list[str]:
+    """Identify scenes, write and print their answers, and return the names of scenes whose motion cannot be used, with the reasons.
+
+    Raises:
+        ConfigError: no scene can be used.
+    """
+    from gpe_pl.evaluation.identification.observations import ObservationError
+    from gpe_pl.evaluation.identification.shooting import ShootingError
+
+    left_out, num_answered = list[str](), 0
+    for name, trajectory in named:
+        try:
+            for line in task.run(name, trajectory, folder):
+                print(f"{name}: {line}", flush=True)
+            num_answered += 1
+        except (ObservationError, ShootingError) as error:  # other scenes may have a longer or more complete motion
+            left_out.append(f"{name}: {error}")
+            print(f"{name}: left out: {error}", flush=True)
+    if left_out and not num_answered:
+        raise ConfigError(f"no scene can be identified; {left_out[0]}")
+    return left_out
 
 
 def scenes(path: Path, number: int | None) -> Iterator[tuple[str, Trajectory]]:

@@ -83,7 +83,7 @@ def combined(moments: list[dict[str, Any]]) -> dict[str, Any]:
     The statistics are the root mean squares per component of velocities [m/s] and accelerations without gravity [m/s²], the mean and standard deviation of each
     material parameter on its scale in ``schema``, and the numbers of trajectories, frames and nodes.
     """
-    rms = {}
+    moments, rms = [m for m in moments if m["trajectories"]], {}
     for key in ("velocity", "acceleration"):
         rms[key] = math.sqrt(math.fsum(m[key][1] for m in moments) / sum(m[key][0] for m in moments))
     count, total, square = np.sum([m["params"] for m in moments], axis=0)

@@ -20,7 +20,7 @@ Settings (default)
   parameter   value of the material's first parameter (middle of the trained range)
   seconds     length of the film (1)
   seed        number of the scene (0)
-  file        viewer that is written; .png, .svg, .pdf, .gif, .mp4 and .npz also work (demo_MODEL.html)
+  file        viewer that is written; .png, .svg, .pdf, .gif, .mp4 and .npz (a file per rollout) also work (demo_MODEL.html)
   open        open the viewer in the browser (true)"""
 
 KEYS: dict[str, Callable[[str], Any]] = {
@@ -32,22 +32,22 @@ KEYS: dict[str, Callable[[str], Any]] = {
 }
 
 
-def demo(model: str, parameter: float | None = None, seconds: float = 1.0, seed: int = 0, file: Path | None = None, **_: Any) -> Path:
-    """Roll a model and its solver out in one scene, and write the film; returns its file.
+def demo(model: str, parameter: float | None = None, seconds: float = 1.0, seed: int = 0, file: Path | None = None, **_: Any) -> list[Path]:
+    """Roll a model and its solver out in one scene, and write the film; returns its files.
 
     Raises:
         NotRecorded: the model was trained on data that this package did not simulate.
         SceneFault: the scene cannot be solved, such as with an impossible parameter.
     """
     from gpe_pl.learned.simulator import LearnedSimulator
-    from gpe_pl.scenes.film import Film, check_type
+    from gpe_pl.scenes.film import Film, check_file
     from gpe_pl.scenes.recorded import recorded_scene, recorded_solver
     from gpe_pl.scenes.rollouts import middle_values, predicted, solved
     from gpe_pl.solvers.materials import limits_fault
 
     name = model_name(model, ".")
     file = file or Path(f"demo_{name}.html")
-    check_type(file)
+    check_file(file)
     simulator = LearnedSimulator.from_checkpoint(model)
     trained = simulator.builder.metadata
     scene, solver = recorded_scene(trained), recorded_solver(trained)
@@ -69,7 +69,8 @@ def demo(model: str, parameter: float | None = None, seconds: float = 1.0, seed:
         {name: prediction},
     )
     print(film.summary())
-    return film.write(file)
+    film.write(file)
+    return film.files(file)
 
 
 def run(model: str | None, values: dict[str, Any]) -> None:
@@ -81,8 +82,8 @@ def run(model: str | None, values: dict[str, Any]) -> None:
             f"gpe demo{' ' + model if model else ''}: name a shipped model ({', '.join(names())}), or the folder of a run"
             f"{did_you_mean(model, names()) if model else ''}"
         )
-    path = demo(model, **values)
-    print(path)
+    path, *others = demo(model, **values)
+    print(path, *others, sep="\n")
     if values.get("open", True) and path.suffix == ".html" and not open_page(path):
         print("no browser here; copy the file, which needs nothing else, and open it elsewhere")
 

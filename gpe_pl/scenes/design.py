@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from gpe_pl.errors import GpeError
-from gpe_pl.scenes.film import Film, check_type
+from gpe_pl.scenes.film import Film, check_file
 from gpe_pl.scenes.rollouts import predicted, solved
 from gpe_pl.scenes.scene import Point, Scene
 from gpe_pl.system.command_line import ArgumentFault, command, integer, number, truth
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Method = Literal["auto", "gradient", "derivative_free"]
 METHODS: tuple[Method, ...] = ("auto", "gradient", "derivative_free")
+LEAST_GAIN = 1e-6
+"""Relative gain in the mean squared distance below which a pose is not better than that of the start: the rounding of rollouts that nothing guides."""
 
 ABOUT = """Move an obstacle until it guides the bodies of a scene to a target: gpe design SCENE.yaml target=X,Y [KEY=VALUE …]
 
@@ -38,7 +40,7 @@ Settings (default)
   method       auto: gradients if a check by finite differences trusts them; gradient, derivative_free (auto)
   evaluations  largest number of rollouts after the scan (30)
   solve        also run the solver at the start and at the optimum (true)
-  file         viewer of the optimum; .png, .svg, .pdf, .gif, .mp4 and .npz also work (SCENE_design.html)"""
+  file         viewer of the optimum; .png, .svg, .pdf, .gif, .mp4 and .npz (a file per rollout) also work (SCENE_design.html)"""
 
 
 class DesignFault(GpeError, ValueError):
@@ -51,7 +53,7 @@ class Design:
 
     Attributes:
         scene: the scene with the obstacle at the best pose.
-        pose: shift [m] and angle [rad].
+        pose: shift [m] and angle [rad]; zeros if no other pose that was tried is better.
         distances: root mean square distance of nodes from the target [m] of the search's rollouts, by ``model`` and ``solver``, at the start and at the best
             pose.
         rollouts: rollouts at the best pose, by name.
@@ -76,6 +78,10 @@ class Design:
         from gpe_pl.evaluation.design.pose import text
 
         lines = [f"best pose: {text(self.pose)}"]
+        if not any(self.pose):
+            lines = [
+                "best pose: that of the start, as no other that was tried is better; if the bodies do not reach the obstacle in time, raise seconds"
+            ]
         lines += [
             f"{name}: distance from the target {_in_metres(after)}, {_in_metres(before)} at the start"
             for name, (before, after) in self.distances.items()
@@ -142,6 +148,8 @@ def design(
     name, shape = scene.obstacles[obstacle - 1]
     movable = Obstacle.of(shape, state.boundary)
     limits = (shift, shift, 0.0 if isinstance(shape, Sphere) else math.radians(angle))
+    if not any(limits):
+        raise DesignFault(f"shift=0: {name} is a disc, which does not turn; give a shift of more than 0")
     movable.check_limits(limits, state.boundary, state.pos, metadata.spacing)
     num_frames, goal = max(1, round(seconds / metadata.frame_dt)), np.asarray(target, np.float64)
     start = simulator.standing(state, metadata)
@@ -152,10 +160,12 @@ def design(
         raise DesignFault(
             f"every rollout failed, with all {len(found.tried)} poses that were tried; check the scene, and shorten seconds={seconds}"
         )
-    spent, best = time.process_time() - began, tuple(guidance.pose(found.z).tolist())
-    moved = replace(scene, obstacles=tuple((n, movable.moved_shape(best) if n == name else own) for n, own in scene.obstacles))
+    spent, is_better = time.process_time() - began, found.misfit < before - LEAST_GAIN
+    best, after = (tuple(guidance.pose(found.z).tolist()), found.misfit) if is_better else ((0.0, 0.0, 0.0), before)
+    changed = {name: movable.moved_shape(best)} if is_better else {}
+    moved = replace(scene, obstacles=tuple((n, changed.get(n, own)) for n, own in scene.obstacles))
     failed = math.log(guidance.failed)
-    distances = {"model": (math.nan if before >= failed else math.exp(before / 2), math.exp(found.misfit / 2))}
+    distances = {"model": (math.nan if before >= failed else math.exp(before / 2), math.exp(after / 2))}
     rollouts, at_best = {}, moved.state(simulator)[0]
     if solve:
         solver = scene.solver_of(simulator)
@@ -163,7 +173,7 @@ def design(
         before_it, after_it = (_distance(own, goal) for own in pair)
         distances["solver"], rollouts["solver"] = (before_it, after_it), pair[1]
     rollouts["model"] = predicted(simulator, at_best, metadata, num_frames, "model")
-    check = "" if found.check is None else str(found.check)
+    check = "" if found.check is None or not is_better else str(found.check)
     return Design(moved, best, distances, rollouts, found.method, check, guidance.num_evaluations, guidance.num_gradients, spent)
 
 
@@ -233,13 +243,15 @@ def run(word: str | None, values: dict[str, Any]) -> None:
         raise ArgumentFault("gpe design: name a scene file, such as scene.yaml; `gpe predict --help` shows one")
     given = dict(values)
     file = given.pop("file", Path(f"{Path(word).stem}_design.html"))
-    check_type(file)
+    check_file(file)
     if "target" not in given:
         raise ArgumentFault("gpe design: name the point that the bodies should reach, such as target=0.8,0.1")
     model = given.pop("checkpoint", None)
     found = design(read_scene(word), given.pop("target"), model=model, **given)
     print(found.summary())
-    print(found.film().write(file))
+    film = found.film()
+    film.write(file)
+    print(*film.files(file), sep="\n")
 
 
 main = command(run, ABOUT, "scene file", KEYS)

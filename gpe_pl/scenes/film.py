@@ -11,6 +11,8 @@ import numpy as np
 
 from gpe_pl.errors import GpeError
 from gpe_pl.export.trajectories import write_npz
+from gpe_pl.files.destinations import file_fault
+from gpe_pl.files.names import portable
 from gpe_pl.metrics.open_scenes import entering, leaving, ledger
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.browser import open_page
@@ -26,7 +28,7 @@ ANIMATIONS = (".gif", ".mp4")
 
 
 class FilmFault(GpeError, ValueError):
-    """Raised for a file type that a film cannot be written as."""
+    """Raised for a file as which a film cannot be written."""
 
 
 @dataclass(frozen=True)
@@ -69,15 +71,17 @@ class Film:
         return float(np.sqrt(np.mean(np.sum(apart**2, axis=-1)))) if count > 1 else 0.0
 
     def write(self, path: Path | str) -> Path:
-        """Write a viewer (.html), a figure (.png, .svg, .pdf), an animation (.gif, .mp4), or the last rollout as arrays (.npz); returns the path.
+        """Write a viewer (.html), a figure (.png, .svg, .pdf), an animation (.gif, .mp4), or arrays (.npz); returns the path.
+
+        Of several rollouts, arrays become one file each (see ``files``), and the path of the first is returned.
 
         Raises:
-            FilmFault: another file type.
+            FilmFault: another file type, or a place where no file can be.
             OSError: the file cannot be written.
         """
         path = Path(path)
         stride = max(1, -(-self.first.num_frames // MOST_FRAMES))
-        check_type(path)
+        check_file(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".html":
             write_viewer(path, self.first, self.others, stride=stride, title=self.title)
@@ -86,8 +90,17 @@ class Film:
         elif path.suffix in ANIMATIONS:
             write_animation(path, self.first, self.others, stride=stride)
         else:
-            write_npz(path, [self.first, *self.others.values()][-1])
-        return path
+            for file, rollout in zip(self.files(path), (self.first, *self.others.values()), strict=True):
+                write_npz(file, rollout)
+        return self.files(path)[0]
+
+    def files(self, path: Path | str) -> list[Path]:
+        """Return the files that ``write`` writes: ``path``, or for arrays of several rollouts ``path`` with the name of each added, in their order."""
+        path = Path(path)
+        if path.suffix != ".npz" or not self.others:
+            return [path]
+        names = with_heading(self.first, self.others)
+        return [path.with_stem(f"{path.stem}_{portable(name.replace(' ', '_'))}") for name in names]
 
     def _repr_html_(self) -> str:
         """Return the viewer for a notebook."""
@@ -114,8 +127,10 @@ def _account(rollout: Trajectory) -> str:
     return f", {entered} entered, {left} left; in the second half {rates[0]}, {rates[1]} and {stays}"
 
 
-def check_type(path: Path) -> None:
-    """Raise ``FilmFault`` if a film cannot be written as a file of this type."""
+def check_file(path: Path) -> None:
+    """Raise ``FilmFault`` if a film cannot be written as a file of this type, or not at this place."""
     known = (".html", *FIGURES, *ANIMATIONS, ".npz")
     if path.suffix not in known:
         raise FilmFault(f"{path}: files of type {path.suffix or 'none'} are not written; take one of {', '.join(known)}")
+    if fault := file_fault(path):
+        raise FilmFault(f"file={path}: {fault}; name another file")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from gpe_pl.errors import GpeError
 from gpe_pl.errors.printable import did_you_mean
+from gpe_pl.files.destinations import folder_fault
 from gpe_pl.learned.pretrained import model_name, names
 from gpe_pl.system.command_line import ArgumentFault, command, integer, truth
 
@@ -109,6 +110,8 @@ def run(model: str | None, values: dict[str, Any]) -> None:
         raise ArgumentFault(
             f"gpe play {model}: name a shipped model ({', '.join(SHIPPED)}), or the folder of a run{did_you_mean(model, SHIPPED)}"
         )
+    if "folder" in values and (fault := folder_fault(values["folder"])):
+        raise ArgumentFault(f"folder={values['folder']}: {fault}; name another folder")
     models, num_films = [model] if model else [*SHIPPED], values.get("films", 0)
     if "folder" in values:
         print(write(values["folder"], models, num_films))

@@ -18,7 +18,7 @@ Settings (default)
   checkpoint   shipped model, folder of a run, or path of a checkpoint (the shipped model of the material)
   seconds      length of the film (1)
   solve        also run the solver, and compare (false)
-  file         viewer that is written; .png, .svg, .pdf, .gif, .mp4 and .npz also work (SCENE.html)
+  file         viewer that is written; .png, .svg, .pdf, .gif, .mp4 and .npz (a file per rollout) also work (SCENE.html)
   open         open the viewer in the browser (true)
 
 A scene file looks like this; the guide, "A scene of your own", lists all keys:
@@ -35,7 +35,7 @@ KEYS: dict[str, Callable[[str], Any]] = {"checkpoint": str, "seconds": number(1e
 
 def run(word: str | None, values: dict[str, Any]) -> None:
     """Roll the scene out, write the film, and open it. A scene with faults is drawn to a picture."""
-    from gpe_pl.scenes.film import check_type
+    from gpe_pl.scenes.film import check_file
     from gpe_pl.scenes.picture import draw
     from gpe_pl.scenes.scene import SceneFault
     from gpe_pl.scenes.scene_file import read_scene
@@ -44,7 +44,7 @@ def run(word: str | None, values: dict[str, Any]) -> None:
     if word is None:
         raise ArgumentFault("gpe predict: name a scene file, such as scene.yaml; `gpe predict --help` shows one")
     file = values.get("file") or Path(f"{Path(word).stem}.html")
-    check_type(file)
+    check_file(file)
     scene = read_scene(word)
     roll_out = scene.compare if values.get("solve", False) else scene.predict
     try:
@@ -56,7 +56,8 @@ def run(word: str | None, values: dict[str, Any]) -> None:
         draw(scene, fault.faults, picture)
         raise SceneFault({**fault.faults, f"see {picture}": "faults are red"}) from None
     print(film.summary())
-    print(film.write(file))
+    film.write(file)
+    print(*film.files(file), sep="\n")
     if values.get("open", True) and file.suffix == ".html" and not open_page(file):
         print("no browser here; copy the file, which needs nothing else, and open it elsewhere")
 

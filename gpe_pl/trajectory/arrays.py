@@ -54,6 +54,7 @@ def numbers(name: str, values: Any, axes: Mapping[str, int | None]) -> np.ndarra
         raise ArrayError(f"{name}: not an array of numbers ({error})") from None
     if array.dtype.kind not in "fiu":
         raise ArrayError(f"{name}: has type {array.dtype}, expected real numbers")
+    array = array.astype(np.float32) if array.dtype == np.float16 else array  # half precision has no number as large as ``LARGEST``
     wanted = ", ".join(axis if size is None else f"{axis} {size}" for axis, size in axes.items())
     if array.ndim != len(axes) or any(size is not None and size != n for size, n in zip(axes.values(), array.shape, strict=True)):
         raise ArrayError(f"{name}: has shape {list(array.shape)}, expected [{wanted}]")

@@ -107,7 +107,9 @@ def _images(rows: dict[str, Trajectory], frames: Sequence[int], coloring: Colori
     line, gap = 24, 8
     words = [*filter(None, [in_common(list(rows.values())), coloring.explanation])]
     characters = int(len(rows) * panel_pixels / CHARACTER_PIXELS)
-    caption = [text] if len(text := "; ".join(words)) <= characters else [part for word in words for part in textwrap.wrap(word, characters)]
+    caption = (
+        [text] if len(text := "; ".join(words)) <= characters else [part for word in words for part in textwrap.wrap(word, characters)]
+    )
     legend = coloring.legend(rows.values())
     key = BAR_PIXELS if coloring.bar_label else line if legend else 0
     title = line * (1 + len(caption)) + key

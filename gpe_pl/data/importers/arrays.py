@@ -141,7 +141,8 @@ def _load(path: Path, stated: Facts, facts: Facts) -> Loaded:
     if wall:
         if "pos" not in wall:
             raise Refusal("has boundary arrays but no 'boundary_pos'")
-        moves = wall["pos"].ndim == 3
+        moves, dim = wall["pos"].ndim == 3, values["pos"].shape[-1] if values["pos"].ndim == 3 else None
+        wall["pos"] = numbers("boundary_pos", wall["pos"], {**({"frame": None} if moves else {}), "boundary_node": None, "dim": dim})
         if "normal" not in wall:
             points, visited = (wall["pos"][0], values["pos"][0]) if moves else (wall["pos"], values["pos"])
             wall["normal"] = estimated_normals(points, visited, space)

@@ -26,7 +26,7 @@ from gpe_pl.files import sealed
 from gpe_pl.files.atomic import free_bytes, replacing
 from gpe_pl.files.names import NameRefused, data_name
 from gpe_pl.geometry.periodicity import PeriodicityError
-from gpe_pl.schema import HISTORY, LOADS, MATERIALS, SPLITS, ParameterGroup, node_code, param_names, stored_parameters
+from gpe_pl.schema import HISTORY, LOADS, MATERIALS, SPLITS, ParameterGroup, node_code, param_names
 from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
 from gpe_pl.trajectory.arrays import ArrayError
@@ -219,6 +219,7 @@ class _Conversion:
                     continue
                 self.report.repairs += [Event(split, item.name, repair.frame, repair.what) for repair in loaded.repairs]
                 self.report.notes += [note for note in loaded.notes if note not in self.report.notes]
+        self.report.refusals += self.survey.refused_as_incomplete()
         self.report.notes = [*self.facts.notes, *self.report.notes]
 
     def _load(self, item: Item) -> Loaded:
@@ -405,7 +406,7 @@ class _Conversion:
             raise ImportFailure(f"{self.report.source}: no trajectory of {split} can be used: {self.report.refusals[-1]}")
 
     def _unified(self, trajectory: Trajectory, split: str) -> Trajectory:
-        """Give a trajectory the origin, metadata and material columns of the whole data set; raises ``Refusal`` if it lacks a parameter."""
+        """Give a trajectory the origin, metadata and material columns of the whole data set."""
         if self.origin.any():
             trajectory = trajectory.seen_from(self.origin)
         facts, m = self.facts, trajectory.metadata
@@ -415,15 +416,7 @@ class _Conversion:
         columns = np.full((trajectory.num_nodes, len(names)), np.nan, np.float32)
         for old, name in enumerate(m.param_names):
             columns[:, names.index(name)] = trajectory.material_params[:, old]
-        for material in m.materials:
-            lacking = [p.name for p in stored_parameters(material, names) if p.name not in m.param_names]
-            if lacking:
-                raise Refusal(
-                    f"has no {lacking[0]} of {material}, which other trajectories have; give it to all, or choose parameters={{{material}: …}}"
-                )
         stressed = tuple(name for name in materials if name in self.survey.stressed)
-        if stressed and trajectory.stress is None:
-            raise Refusal("has no stress, which other trajectories have; give it to all or to none")
         metadata = replace(
             m, dataset=self.report.name, materials=materials, stress_materials=stressed, loads=tuple(name for name in LOADS if name in self.survey.loads),
             param_names=names, spacing=facts.spacing,

@@ -14,7 +14,7 @@ from gpe_pl.data.importers.report import Event
 from gpe_pl.data.importers.sampled import free_flight_of
 from gpe_pl.data.importers.source import Facts, Item, Loaded, Refusal
 from gpe_pl.data.position_rounding import MotionSummary, motion_of
-from gpe_pl.schema import HISTORY, NODE_TYPES
+from gpe_pl.schema import HISTORY, NODE_TYPES, stored_parameters
 from gpe_pl.trajectory.arrays import nearest_distances
 from gpe_pl.trajectory.rigid_deformation import rigid_deformation
 from gpe_pl.trajectory.store import stored_arrays
@@ -64,6 +64,7 @@ class Survey:
         num_bytes: size of all arrays.
         flights: groups in free flight of each trajectory.
         common: frame interval [s], dimension and periodic axes of all trajectories.
+        contents: metadata of each usable trajectory, and whether it has a stress, by the identity of its item.
     """
 
     good: dict[str, list[Item]] = field(default_factory=dict)
@@ -85,6 +86,7 @@ class Survey:
     num_bytes: int = 0
     flights: list[Flight] = field(default_factory=list)
     common: tuple[float, int, tuple[bool, ...]] | None = None
+    contents: dict[int, tuple[Metadata, bool]] = field(default_factory=dict)
 
     def add(self, split: str, item: Item, loaded: Loaded, facts: Facts) -> None:
         """Add a trajectory.
@@ -121,6 +123,7 @@ class Survey:
             self.suspects.append(Event(split, name, -1, what))
         self.good.setdefault(split, []).append(item)
         self.recordings.add(item, part)
+        self.contents[id(item)] = m, trajectory.stress is not None
         self.suspects += [Event(split, name, -1, warning) for warning in loaded.warnings]
         self.motions.append((split, name, motion_of(m, trajectory.pos)))
         self.assumes_gravity.append(loaded.assumes_gravity)
@@ -148,6 +151,22 @@ class Survey:
             self.radii.append(m.connectivity_radius)
             if (ratio := _velocity_ratio(trajectory)) is not None:
                 self.velocity_ratios.append(ratio)
+
+    def refused_as_incomplete(self) -> Iterator[Event]:
+        """Remove trajectories that lack a parameter or a stress of others from ``good``, and yield why."""
+        for split, items in self.good.items():
+            reasons = [self._lacks(item) for item in items]
+            self.good[split] = [item for item, reason in zip(items, reasons, strict=True) if not reason]
+            yield from (Event(split, item.name, -1, reason) for item, reason in zip(items, reasons, strict=True) if reason)
+
+    def _lacks(self, item: Item) -> str:
+        m, has_stress = self.contents[id(item)]
+        for material in m.materials:
+            if lacking := [p.name for p in stored_parameters(material, [*self.columns]) if p.name not in m.param_names]:
+                return f"has no {lacking[0]} of {material}, which other trajectories have; give it to all, or choose parameters={{{material}: …}}"
+        if self.stressed and not has_stress:
+            return "has no stress, which other trajectories have; give it to all or to none"
+        return ""
 
     def look_for_outliers(self) -> None:
         """Add suspects: trajectories whose distances, length or free flight differ from those of the others."""

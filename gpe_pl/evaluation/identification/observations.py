@@ -57,7 +57,7 @@ class Observations:
         noise: standard deviation of the noise in the positions [m].
 
     Raises:
-        ObservationError: flags do not fit the trajectory, too few frames are observed, or the scene is open.
+        ObservationError: flags do not fit the trajectory, too few frames are observed, an observed position is not finite, or the scene is open.
     """
 
     trajectory: Trajectory
@@ -71,6 +71,11 @@ class Observations:
             )
         if self.trajectory.alive is not None:
             raise ObservationError("nodes enter or leave the scene, which no search follows; observe a scene without openings")
+        if len(unknown := np.argwhere(self.seen & ~np.isfinite(self.trajectory.pos).all(axis=2))):
+            frame, node = unknown[0]
+            raise ObservationError(
+                f"frame {frame}, node {node}: is marked as seen, and its position is not a number; set seen to False there"
+            )
         if self.seen.any(axis=1).sum() < 2:
             raise ObservationError("fewer than 2 frames have observed nodes; observe more frames")
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.identification.answer import (
     FOLDER,
     MODEL,
@@ -24,7 +25,7 @@ from gpe_pl.evaluation.identification.answer import (
     side_by_side,
 )
 from gpe_pl.evaluation.identification.calibration import Calibration, cross_calibrated
-from gpe_pl.evaluation.identification.observations import ObservationError, Observations, ObservationSettings
+from gpe_pl.evaluation.identification.observations import Observations, ObservationSettings
 from gpe_pl.evaluation.identification.pictures import misfit_figure
 from gpe_pl.evaluation.identification.scene import SolverError, identify_parameters, solver_bounds, solver_of, trained_bounds
 from gpe_pl.evaluation.identification.search import SearchSettings
@@ -42,6 +43,10 @@ from gpe_pl.viz.saving import save_figure
 
 SHOWN_FRAMES = 60
 """Largest number of frames of the picture of observed and fitted motion."""
+
+
+class MotionError(GpeError, ValueError):
+    """Raised for a motion that the calibration is from, or that is not the one of a stored answer."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class Task:
         observed = Observations.of(trajectory, self.observations)
         bounds = {**solver_bounds(trajectory.metadata), **trained_bounds(self.model), **self.bounds}
         if observed.digest in self.calibrated_on:
-            raise ObservationError(f"{name}: this motion is one of those that the calibration is from; calibrate on other scenes")
+            raise MotionError(f"{name}: this motion is one of those that the calibration is from; calibrate on other scenes")
         answers: dict[str, Answer] = {}
         misfit, motion = (folder / FOLDER / f"{name}_{what}.png" for what in ("misfit", "motion"))
         is_drawn = misfit.exists() and motion.exists()
@@ -97,7 +102,7 @@ class Task:
                 is_drawn = False
             answers[kind] = read_answer(path)
             if answers[kind].observed != observed.digest:
-                raise ObservationError(
+                raise MotionError(
                     f"{path}: is the answer for another motion than that of {name} in the trajectories now; choose another name=… or delete {folder}"
                 )
         sought = unknowns_of(observed.completed, self.unknowns, bounds, self.per_body)

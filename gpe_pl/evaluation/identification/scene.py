@@ -36,7 +36,7 @@ class SolverError(GpeError, ValueError):
 def identify_parameters(
     simulator: LearnedSimulator | Simulator,
     observed: Trajectory | Observations,
-    unknowns: Sequence[str] | None = None,
+    unknowns: Sequence[str] | str | None = None,
     *,
     per_body: bool = False,
     bounds: Bounds | None = None,
@@ -56,7 +56,7 @@ def identify_parameters(
     Args:
         simulator: trained model, or a solver.
         observed: a trajectory, or observations with missing parts or noise.
-        unknowns: names ``MATERIAL``, ``MATERIAL.PARAMETER``, ``velocity`` or ``gravity``; None takes all material parameters.
+        unknowns: names ``MATERIAL``, ``MATERIAL.PARAMETER``, ``velocity`` or ``gravity``, or one such name; None takes all material parameters.
         per_body: give each body values of its own.
         bounds: lowest and highest value by ``MATERIAL.PARAMETER``; by default the model's range in training. Solvers need bounds.
         shooting_settings: windows of the rollouts.

@@ -114,12 +114,15 @@ def search(objective: Objective, settings: SearchSettings | None = None, on_prog
     is_unfinished = not result.success and len(tried) - num_scanned >= s.max_evaluations
     if follows:
         follow_valleys(misfit, tried, s.profile_evaluations)
-    z, least = min(tried, key=lambda pair: pair[1])
+    z, least = min(tried, key=lambda pair: (pair[1], float(np.abs(pair[0] - 0.5).max())))
     return Found(np.clip(z, 0.0, 1.0), least, method, check, tried, is_unfinished)
 
 
 def _scanned(misfit: Callable[[np.ndarray], float], number: int, num_scanned: int) -> tuple[np.ndarray, float]:
-    """Return the start of the search, and the distance of scanned values: each unknown is scanned in turn, the others at the best values so far."""
+    """Return the start of the search, and the distance of scanned values: each unknown is scanned in turn, the others at the best values so far.
+
+    Of equal misfits, the value nearest to the middle is the best, as the unknown may have no effect.
+    """
     z = np.full(number, 0.5)
     if number >= ALL_AT_ONCE:
         misfit(z)
@@ -127,5 +130,5 @@ def _scanned(misfit: Callable[[np.ndarray], float], number: int, num_scanned: in
     values = np.linspace(0.0, 1.0, num_scanned)
     for k in range(number):
         candidates = [np.concatenate([z[:k], [value], z[k + 1 :]]) for value in values]
-        z = candidates[int(np.argmin([misfit(candidate) for candidate in candidates]))]
+        z = min(candidates, key=lambda candidate: (misfit(candidate), abs(candidate[k] - 0.5)))
     return z, float(values[1])

@@ -148,13 +148,14 @@ def _across(gravity: Any, axis: int) -> Any:
 
 
 def unknowns_of(
-    trajectory: Trajectory, wanted: Sequence[str] | None, ranges: Bounds, per_body: bool = False, first_frame: int = 0
+    trajectory: Trajectory, wanted: Sequence[str] | str | None, ranges: Bounds, per_body: bool = False, first_frame: int = 0
 ) -> Unknowns:
     """Return the unknowns of a scene.
 
     Args:
         trajectory: the observed scene; its stored values become ``truth``.
-        wanted: names ``MATERIAL``, ``MATERIAL.PARAMETER``, ``velocity`` or ``gravity``; None takes all parameters of all materials of the scene.
+        wanted: names ``MATERIAL``, ``MATERIAL.PARAMETER``, ``velocity`` or ``gravity``, or one such name; None takes all parameters of all
+            materials of the scene.
         ranges: bounds of material parameters by name ``MATERIAL.PARAMETER``.
         per_body: give each body values of its own.
         first_frame: frame in which nodes near each other are one body.
@@ -166,7 +167,8 @@ def unknowns_of(
     if misspelt := sorted(set(ranges) - PARAMETERS):
         raise UnknownError(f"bounds: {misspelt[0]!r} is no MATERIAL.PARAMETER{did_you_mean(misspelt[0], sorted(PARAMETERS))}")
     groups = scene_bodies(trajectory, first_frame) if per_body else []
-    for name in materials_of(trajectory) if wanted is None else wanted:
+    names = [wanted] if isinstance(wanted, str) else wanted
+    for name in materials_of(trajectory) if names is None else names:
         material, _, parameter = name.partition(".")
         if material in (VELOCITY, GRAVITY) and parameter:
             raise UnknownError(f"unknowns: {name!r}: {material} has no parts; write {material}")
@@ -178,8 +180,8 @@ def unknowns_of(
             found += _parameters(trajectory, material, parameter, ranges, groups)
     if not found:
         raise UnknownError("unknowns=[]: name at least one, such as sand.friction_angle")
-    names = [unknown.name for unknown in found]
-    if twice := [name for name in names if names.count(name) > 1]:
+    named = [unknown.name for unknown in found]
+    if twice := [name for name in named if named.count(name) > 1]:
         raise UnknownError(f"unknowns: {twice[0]} is named twice; name a parameter, or its material, once")
     return Unknowns(tuple(found))
 

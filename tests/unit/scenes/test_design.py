@@ -42,6 +42,8 @@ def scene(shape: Any = RAMP) -> Scene:
         (lambda: design(scene(), (0.8, 0.1), shift=0.4), "the obstacle touches"),
         (lambda: design(scene(), (0.8, 0.1), seconds=0.0), "seconds=0.0: must be more than 0"),
         (lambda: design(scene(Circle((0.5, 0.05), 0.1)), (0.8, 0.1)), "obstacle: it touches a wall or another obstacle"),
+        (lambda: design(scene(Circle((0.6, 0.3), 0.1)), (0.8, 0.1), shift=0.0), "shift=0: obstacle 1 is a disc, which does not turn"),
+        (lambda: verb.run("scene.yaml", {"target": (0.8, 0.1), "file": Path(__file__) / "a.html"}), "is a file and no folder; name another file"),
         (lambda: verb.run(None, {}), "gpe design: name a scene file"),
         (lambda: verb.run("scene.yaml", {}), "gpe design: name the point that the bodies should reach"),
     ],
@@ -73,6 +75,17 @@ def test_a_rollout_that_stopped_has_no_distance() -> None:
     text = Design(scene(), (0.0, 0.0, 0.0), distances, {}, "gradient", "", 1, 1, 1.0).summary()
     assert "solver: distance from the target not known, as the rollout stopped early, 0.5 m at the start" in text
     assert "keeps" not in text
+
+
+def test_an_obstacle_without_effect_stays_where_it_is() -> None:
+    far = Scene(box=(1.0, 1.0)).block("sand", at=(0.1, 0.0), size=(0.08, 0.08))
+    far = far.obstacle(Polygon(((0.60, 0.5), (0.64, 0.5), (0.64, 0.7), (0.60, 0.7)), 0.3))
+    found = design(far, (0.3, 0.05), seconds=0.02, evaluations=1, solve=False)
+    assert found.pose == (0.0, 0.0, 0.0) and found.scene == far
+    before, after = found.distances["model"]
+    assert before == after
+    assert "best pose: that of the start, as no other that was tried is better" in found.summary() and "gradients" in found.summary()
+    assert "cannot be trusted" not in found.summary()
 
 
 @pytest.mark.slow

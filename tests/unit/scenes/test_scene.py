@@ -20,7 +20,7 @@ from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.scenes import predict
-from gpe_pl.scenes.film import Film
+from gpe_pl.scenes.film import Film, FilmFault
 from gpe_pl.scenes.obstacles import Circle
 from gpe_pl.scenes.rollouts import predicted
 from gpe_pl.scenes.scene import Scene, SceneFault
@@ -332,3 +332,14 @@ def test_a_model_stays_near_the_solver_in_a_scene_of_our_own() -> None:
     fall = 0.5 * 9.81 * 0.2**2
     assert film.distance("sand") < 0.1 * fall
     assert film.first.metadata.solver == "mpm" and film.first.num_frames == 41
+
+
+def test_arrays_hold_every_rollout(tmp_path: Path) -> None:
+    film = column().compare("sand", 0.02)
+    assert film.write(tmp_path / "a.npz") == tmp_path / "a_ground_truth.npz"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a_ground_truth.npz", "a_sand.npz"]
+    for path, rollout_of in zip(film.files(tmp_path / "a.npz"), (film.first, film.others["sand"]), strict=True):
+        with np.load(path) as arrays:
+            np.testing.assert_allclose(arrays["pos"], rollout_of.pos, rtol=1e-6)
+    with pytest.raises(FilmFault, match=r"a_sand.npz/b.png: .*a_sand.npz is a file and no folder; name another file"):
+        film.write(tmp_path / "a_sand.npz" / "b.png")

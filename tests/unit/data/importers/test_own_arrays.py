@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from gpe_pl.data.importers import ImportFailure
+from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests import sources
 from tests.sources import DT, SPACING, motion
 from tests.unit.data.importers.test_formats import assert_stored, drift, imported
@@ -147,3 +149,27 @@ def test_walls_are_at_the_bounds_of_each_file(tmp_path: Path) -> None:
         assert trajectory.metadata.bounds[0][1] - trajectory.metadata.bounds[0][0] == pytest.approx(2)
         assert len(trajectory.boundary.pos) and np.ptp(trajectory.boundary.pos[:, 0]) == 0
         assert trajectory.boundary.pos[0, 0] - trajectory.metadata.bounds[0][0] == pytest.approx(width, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("wall", "message"),
+    [
+        (np.zeros((4, 3)), r"boundary_pos: has shape \[4, 3\], expected \[boundary_node, dim 2\]"),
+        (np.full((4, 2), np.nan), "boundary_pos: boundary_node 0 is nan"),
+        (np.zeros(4), r"boundary_pos: has shape \[4\]"),
+    ],
+)
+def test_walls_without_normals_are_checked_first(tmp_path: Path, wall: np.ndarray, message: str) -> None:
+    (tmp_path / "raw" / "train").mkdir(parents=True)
+    pos = np.random.default_rng(0).uniform(size=(12, 9, 2))
+    np.savez(tmp_path / "raw" / "train" / "a.npz", pos=pos, frame_dt=0.01, materials="sand", params_sand=30.0, boundary_pos=wall)
+    with pytest.raises(ImportFailure, match=message):
+        import_dataset(tmp_path, ImportSettings(format="arrays", source=str(tmp_path / "raw")))
+
+
+def test_half_precision_is_read(tmp_path: Path) -> None:
+    pos = np.random.default_rng(0).uniform(size=(5, 9, 2)).astype(np.float16)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        trajectory = Trajectory.from_numpy(pos, 0.01, "sand", {"sand": 30.0})
+    np.testing.assert_array_equal(trajectory.pos, pos)

@@ -64,6 +64,14 @@ def test_without_a_stress_there_are_no_channels(tmp_path: Path) -> None:
     assert GraphBuilder(GraphConfig(), solid.metadata).spec.stress_channels == {}
 
 
+def test_trajectories_without_a_stress_do_not_count_for_the_splits(tmp_path: Path) -> None:
+    """They would fill a shard, and be those that are held out."""
+    train = [stressed(k, has_stress=k < 8) for k in range(20)]
+    report = save_dataset(tmp_path, "some", holdout=0.2, train=train)
+    assert len(report.refusals) == 12
+    assert [len([*iter_trajectories(Path(report.folder), split)]) for split in ("train", "val", "test")] == [4, 2, 2]
+
+
 def test_a_stress_of_another_shape_is_refused() -> None:
     pos = motion()
     with pytest.raises(ArrayError, match=r"stress: has shape \[10, 20, 6\], expected \[frame 10, node 20, component 4\]"):

@@ -19,14 +19,14 @@ from gpe_pl.evaluation.identification.calibration import FewScenesError, Known, 
 from gpe_pl.evaluation.identification.gradient_check import GradientCheck, gradient_check
 from gpe_pl.evaluation.identification.observations import ObservationError, Observations, ObservationSettings
 from gpe_pl.evaluation.identification.profile import Profile
-from gpe_pl.evaluation.identification.results import Task, write_table
+from gpe_pl.evaluation.identification.results import MotionError, Task, write_table
 from gpe_pl.evaluation.identification.scene import SolverError, identify_parameters, solver_of
 from gpe_pl.evaluation.identification.search import SearchSettings
 from gpe_pl.evaluation.identification.shooting import Shooting, ShootingError, ShootingSettings, shooting
 from gpe_pl.evaluation.identification.unknowns import UnknownError, unknowns_of
 from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.files import sealed
-from gpe_pl.identify import Settings, _calibrations, _identity
+from gpe_pl.identify import Settings, _calibrations, _identity, identify_all
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.conformal import interval_score
 from gpe_pl.models.gpe import GPE
@@ -167,9 +167,13 @@ def test_refusals() -> None:
     with pytest.raises(UnknownError, match=r"'snow' is no material of the scene; it has sand"):
         identify_parameters(Drag(), seen, ["snow"], bounds=BOUNDS)
     with pytest.raises(UnknownError, match=r"no stored parameter 'cohesion'; it has friction_angle"):
-        identify_parameters(Drag(), seen, ["sand.cohesion"], bounds=BOUNDS)
+        identify_parameters(Drag(), seen, "sand.cohesion", bounds=BOUNDS)
     with pytest.raises(UnknownError, match=r"give one with bounds='\{sand\.friction_angle:\[LOW,HIGH\]\}'"):
         identify_parameters(Drag(), seen)
+    lost = seen.pos.copy()
+    lost[4, 2] = np.nan
+    with pytest.raises(ObservationError, match="frame 4, node 2: is marked as seen, and its position is not a number"):
+        Observations(replace(seen, pos=lost), np.ones(seen.pos.shape[:2], dtype=bool))
     with pytest.raises(ObservationError, match="fewer than 2 frames"):
         Observations(seen, np.zeros(seen.pos.shape[:2], dtype=bool))
     with pytest.raises(ShootingError, match="needs the start; choose simulator=model"):
@@ -445,6 +449,19 @@ def test_a_calibration_of_another_search_is_refused(tmp_path: Path, there: dict[
         _calibrations(cfg, settings)
 
 
+def test_a_scene_that_is_too_short_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    model, seen = learned()
+    seen = replace(seen, material_params=np.full_like(seen.material_params, 30.0))
+    few, short = SearchSettings(num_scanned=3, max_evaluations=1), ShootingSettings(horizon=2, num_windows=1)
+    task = Task(model, None, False, {"sand.friction_angle": (1.0, 60.0)}, ("model",), ObservationSettings(), short, few, {})
+    (left_out,) = identify_all(task, [("brief", seen.frames(0, 1)), ("long", seen)], tmp_path)
+    assert left_out.startswith("brief: ")
+    assert "brief: left out: " in (printed := capsys.readouterr().out) and "long: friction angle of sand " in printed
+    assert [answer.scene for answer in read_answers(tmp_path, "model")] == ["long"]
+    with pytest.raises(ConfigError, match="no scene can be identified; brief: "):
+        identify_all(task, [("brief", seen.frames(0, 1))], tmp_path)
+
+
 def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model, seen = learned()
     seen = replace(seen, material_params=np.full_like(seen.material_params, 30.0))
@@ -462,10 +479,10 @@ def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.Monke
     assert [*task.run("first", seen, tmp_path)] == [line]
     assert read_answers(tmp_path, "model") == before
     assert (tmp_path / "scenes" / "first_motion.png").exists()
-    with pytest.raises(ObservationError, match=r"first_model\.json: is the answer for another motion than that of first"):
+    with pytest.raises(MotionError, match=r"first_model\.json: is the answer for another motion than that of first"):
         list(task.run("first", replace(seen, pos=seen.pos + 0.01), tmp_path))
     known = replace(task, calibrated_on={Observations.of(seen).digest})
-    with pytest.raises(ObservationError, match="first: this motion is one of those that the calibration is from"):
+    with pytest.raises(MotionError, match="first: this motion is one of those that the calibration is from"):
         list(known.run("first", seen, tmp_path))
     assert "sand.friction_angle | model | none | 1 |" in write_table(tmp_path)
 
