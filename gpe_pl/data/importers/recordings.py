@@ -1,8 +1,9 @@
 """Trajectories that are parts of one recording: they have frames in common, or one goes on where another ends.
 
 Errors on a part say little about other scenes if the model was trained on another part. Parts in different splits are found. Scenes that start alike and
-fall alike have frames in common at equal times; these are no parts unless one is the beginning of the other. Nodes may be in another order where parts have
-frames in common, but not where one goes on after the other.
+fall alike have frames in common at equal times; these are no parts unless one is the beginning of the other. Bodies that swing come back to where all of them
+started, so scenes with the same first frame do not go on after each other. Nodes may be in another order where parts have frames in common, but not where one
+goes on after the other.
 """
 
 from __future__ import annotations
@@ -113,9 +114,9 @@ class _Earlier:
         if part.size in self.groups:
             members, first, last = self.groups[part.size]
             for how, next_frame, ends in (("goes on after", part.first, last), ("goes on before", first, part.last)):
-                found = np.flatnonzero(_follows(next_frame, ends, part.periodicity))
-                if len(found):
-                    return how, members[int(found[0])]
+                found = [members[k] for k in np.flatnonzero(_follows(next_frame, ends, part.periodicity))]
+                if others := [k for k in found if self.parts[k].digests[0] != part.digests[0]]:
+                    return how, others[0]
         return None
 
     def _with_shared_frames(self, part: Part) -> int | None:

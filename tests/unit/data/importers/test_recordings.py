@@ -35,6 +35,12 @@ def warnings(folder: Path, settings: dict[str, Any] | None = None, **splits: lis
     return [w for w in report.warnings if "recording" in w]
 
 
+def swinging(frequency: float) -> np.ndarray:
+    """Return positions [frame, node, dim] of a clamped body that swings through the place where it started, and is close to it at the end."""
+    phase = np.linspace(0, 2 * np.pi * frequency, NUM_FRAMES)[:, None, None]
+    return START + 0.02 * np.sin(phase) * START[:, :1] * np.array([0.0, 1.0])
+
+
 A, B, C = (recording(seed) for seed in range(3))
 PART = "1 of 1 trajectories is of a recording that is also in another split, the first is "
 
@@ -52,6 +58,7 @@ PART = "1 of 1 trajectories is of a recording that is also in another split, the
         pytest.param(A[:33], A[33:], "val0.npz, which goes on after train, train0.npz", id="next, while it swings"),
         pytest.param(A, B, None, id="two scenes"),
         pytest.param(recording(4, same_start=True), recording(5, same_start=True), None, id="same start"),
+        pytest.param(swinging(1.9713), swinging(2.9587), None, id="back at the start"),
         pytest.param(recording(4, same_start=True)[:30], recording(5, same_start=True), None, id="same start, other lengths"),
     ],
 )
