@@ -93,8 +93,8 @@ def evaluate(
     first = members_of(simulator)[0]
     frame_dt = first.builder.metadata.frame_dt
     start_frame = settings.first_frame(first.builder.config.history, frame_dt)
-    check_formats(settings, simulator)
     simulator = _as_evaluated(simulator, settings)
+    check_formats(settings, simulator)
     run_dir.mkdir(parents=True, exist_ok=True)
     predictor = Predictor(simulator, settings, label, controls, stride, start_frame, seconds=[], bars=bars)
     rows, films = list[Row](), list[SolverFilm]()
@@ -108,7 +108,7 @@ def evaluate(
             files.add(scene, about)
         files.finish()
         films += files.films
-    write_models(run_dir, members_of(simulator)[0], label, films, settings.export)
+    write_models(run_dir, members_of(simulator)[0], label, films, settings.export)  # first, as a run with metrics is finished
     write_cost(run_dir, predictor.seconds, frame_dt)
     write_rows(run_dir / "metrics.csv", rows)
     return rows

@@ -15,10 +15,10 @@ from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.material_controls import AtValue
 from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.evaluation.settings import EvaluationSettings, Export
-from gpe_pl.export.onnx_network import export_network
+from gpe_pl.export.onnx_network import check_network, export_network
 from gpe_pl.export.play_model import check
 from gpe_pl.export.play_page import SolverFilm, check_film, write_page
-from gpe_pl.export.program import export_model, refuse_rigid_bodies
+from gpe_pl.export.program import check_exportable, export_model, refuse_rigid_bodies
 from gpe_pl.learned.ensemble import LearnedEnsemble
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
@@ -44,14 +44,23 @@ def check_formats(settings: EvaluationSettings, simulator: LearnedSimulator | Le
     Raises:
         ExportError: a format needs a package that is not installed, needs scenes with pictures, or takes a single model and the simulator is an ensemble.
         PageError: a page cannot compute the simulator.
+        OnnxError: the model is no GPE.
     """
     formats = settings.export
     single = [kind for kind in ("model", "onnx", "page") if kind in formats]
     if isinstance(simulator, LearnedEnsemble):
         if single:
             raise ExportError(f"evaluation.export: {single[0]} takes a single checkpoint; leave it out, or evaluate one checkpoint")
-    elif "page" in formats:
-        check(simulator)
+    else:
+        if "page" in formats:
+            check(simulator)
+        if "model" in formats:
+            try:
+                check_exportable(simulator)
+            except GpeError as error:
+                raise ExportError(f"evaluation.export: {error}; or leave model out") from None
+        if "onnx" in formats:
+            check_network(simulator)
     if "onnx" in formats and not all(importlib.util.find_spec(name) for name in ("onnx", "onnxruntime", "onnxscript")):
         raise ExportError("evaluation.export: onnx needs onnx, onnxruntime and onnxscript: `pip install 'gpe_pl[onnx]'`, or leave it out")
     if "onnx" in formats and not settings.num_pictures:

@@ -156,6 +156,12 @@ def difference(simulator: LearnedSimulator, other: LearnedSimulator, states: Seq
     return max(float((simulator.step(s).pos - other.step(s).pos).abs().max()) for s in states)
 
 
+def check_network(simulator: LearnedSimulator) -> None:
+    """Raise ``OnnxError`` for a simulator whose model is no GPE."""
+    if type(simulator.model) is not GPE:
+        raise OnnxError(f"ONNX export knows GPE models, and no {type(simulator.model).__name__}; choose evaluation.export=[model]")
+
+
 def export_network(simulator: LearnedSimulator, path: Path | str, states: Sequence[State]) -> float:
     """Write the network of a simulator as an ONNX file, which appears complete or not at all.
 
@@ -174,8 +180,7 @@ def export_network(simulator: LearnedSimulator, path: Path | str, states: Sequen
     path = Path(path)
     if path.suffix != ".onnx":
         raise ValueError(f"{path}: an ONNX file ends in .onnx")
-    if type(simulator.model) is not GPE:
-        raise OnnxError(f"ONNX export knows GPE models, and no {type(simulator.model).__name__}; choose evaluation.export=[model]")
+    check_network(simulator)
     content = _program(simulator, _arguments(simulator, states[0]))
     found = difference(simulator, simulator_of(simulator, content), states)
     if not found <= TOLERANCE:

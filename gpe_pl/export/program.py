@@ -302,17 +302,15 @@ class MirrorAverageError(GpeError, ValueError):
     """Raised for a simulator that averages over mirror images, which an exported program does not."""
 
 
-def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
-    """Write a simulator's step as a ``torch.export`` program to ``path``, which ends in ``.pt2``. The file appears complete or not at all.
+def check_exportable(simulator: LearnedSimulator) -> None:
+    """Raise an error for a simulator whose step a program does not have.
 
     Raises:
-        ValueError: ``path`` has another file type.
         CellError: the model needs the cells of meshes, which a program does not take.
         MirrorAverageError: the simulator averages over mirror images, which a program does not.
         LeastDistanceError: the simulator keeps a least distance of liquid nodes, which a program does not.
         NodeLoadError: the data set of the simulator has prescribed nodes or forces, or the model reads the stress, which a program does not take.
     """
-    path = Path(path)
     if simulator.mirror_average:
         raise MirrorAverageError(
             "exported programs do not average over mirror images; choose evaluation.mirror_average=false to export the model without"
@@ -327,6 +325,17 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
         raise NodeLoadError("exported programs take neither prescribed nodes nor forces; export a model of data without them")
     if simulator.builder.spec.reads_stress:
         raise NodeLoadError("exported programs do not read a stress; export a model with graph.stress=false")
+
+
+def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
+    """Write a simulator's step as a ``torch.export`` program to ``path``, which ends in ``.pt2``. The file appears complete or not at all.
+
+    Raises:
+        ValueError: ``path`` has another file type.
+        CellError, MirrorAverageError, LeastDistanceError, NodeLoadError: as ``check_exportable`` raises them.
+    """
+    path = Path(path)
+    check_exportable(simulator)
     if path.suffix != ".pt2":
         raise ValueError(f"{path}: an exported program ends in .pt2")
     step = ExportedStep(copy.deepcopy(simulator).cpu().eval())

@@ -210,6 +210,8 @@ class _Conversion:
     def _look(self) -> None:
         """Read every trajectory once, refuse those that cannot be used, and collect facts about the others."""
         for split, items in self.source.splits.items():
+            if not items:
+                self.report.warnings.append(f"{split}: the source has this split, and no trajectory in it; is the source complete?")
             for item in items:
                 try:
                     loaded = self._load(item)

@@ -59,9 +59,8 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     splits = {}
     for split, folder in (folders or {"train": path}).items():
         files = sorted(folder.glob("*.inp"), key=lambda file: natural(file.name))
-        if files:
-            splits[split] = [Item(file.stem, partial(_load, file, settings)) for file in files]
-    if not splits:
+        splits[split] = [Item(file.stem, partial(_load, file, settings)) for file in files]
+    if not any(splits.values()):
         raise ImportFailure(f"{path}: {'no such folder' if not path.is_dir() else 'holds no *.inp'}")
     return Source(Facts(frame_dt=_first_interval(splits, path, folders)).overridden(settings), splits, warnings)
 

@@ -31,6 +31,11 @@ UNSEEN = {
     **dict.fromkeys(("CYCLICSYMMETRYMODEL", "CONTACTPAIR", "CONTACT", "GAP"), "couples nodes"),
     **dict.fromkeys(("SPRING", "DASHPOT", "MASS"), "adds forces or masses to nodes"),
     **dict.fromkeys(("INITIALCONDITIONS", "TEMPERATURE"), "moves or strains bodies without a force"),
+    **dict.fromkeys(
+        ("PLASTIC", "CYCLICHARDENING", "DEFORMATIONPLASTICITY", "CREEP", "USERMATERIAL", "DEPVAR"),
+        "gives a material another law than the linear elastic one",
+    ),
+    "MODELCHANGE": "adds or removes elements or contacts",
 }
 """Cards that change the motion by what a trajectory cannot hold, and how."""
 READ_OF_LOADS, READ_OF_AMPLITUDES = {"AMPLITUDE", "OP"}, {"NAME", "TIME"}
@@ -158,8 +163,10 @@ def read(path: Path) -> Deck:
             elif keyword == "DENSITY":
                 deck.density[material] = float(lines[0][0])
             elif keyword == "ELASTIC":
-                deck.elastic[material] = float(lines[0][0]), float(lines[0][1])
+                deck.elastic[material] = _isotropic(parameters, lines)
             elif keyword == "BOUNDARY":
+                if parameters.get("OP", "MOD") != "MOD":
+                    raise ValueError(f"OP={parameters['OP']} releases nodes; leave out what is held before the step instead")
                 for node, axes in _held(lines, sets):
                     deck.held.setdefault(node, set()).update(axes)
             elif keyword == "CLOAD":
@@ -321,6 +328,20 @@ def _numbers(name: str, sets: dict[str, list[int]], what: str) -> list[int]:
     return [int(name)]
 
 
+def _isotropic(parameters: dict[str, str], lines: list[list[str]]) -> tuple[float, float]:
+    """Return Young's modulus and Poisson's ratio of a card *ELASTIC.
+
+    Raises:
+        ValueError: the material is not isotropic, or its constants depend on the temperature.
+    """
+    if parameters.get("TYPE", "ISO") not in ("ISO", "ISOTROPIC"):
+        raise ValueError(f"TYPE={parameters['TYPE']}; only isotropic materials are read")
+    if len(lines) > 1:
+        raise ValueError("constants that depend on the temperature; give those of one temperature")
+    modulus, ratio, *_ = (float(value) for value in lines[0])
+    return modulus, ratio
+
+
 def _factors(amplitude: Amplitude | None, times: np.ndarray) -> np.ndarray:
     """Return the factors of a load at times [frame]."""
     return np.ones(len(times)) if amplitude is None else np.interp(times, *amplitude)
@@ -334,11 +355,16 @@ def _held(lines: list[list[str]], sets: dict[str, list[int]]) -> Iterator[tuple[
 
 
 def _amplitude(parameters: dict[str, str], amplitudes: dict[str, Amplitude]) -> Amplitude | None:
-    return amplitudes[parameters["AMPLITUDE"]] if "AMPLITUDE" in parameters else None
+    name = parameters.get("AMPLITUDE")
+    if name is not None and name not in amplitudes:
+        raise ValueError(f"unknown amplitude {name!r}")
+    return None if name is None else amplitudes[name]
 
 
 def _loaded(lines: list[list[str]], sets: dict[str, list[int]]) -> Iterator[tuple[tuple[int, int], float]]:
     for name, axis, magnitude in lines:
+        if axis not in ("1", "2", "3"):
+            raise ValueError(f"{axis} is no axis of a force; forces act along 1, 2 or 3")
         for node in _numbers(name, sets, "nodes"):
             yield (node, int(axis)), _number(magnitude)
 

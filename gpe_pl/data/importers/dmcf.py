@@ -63,8 +63,8 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         scenes, warnings = {"train": [[path]]}, tuple[str, ...]()
     else:
         folders, warnings = split_folders(path)
-        scenes = {split: found for split, folder in (folders or {"train": path}).items() if (found := _scenes(folder))}
-    if not scenes:
+        scenes = {split: _scenes(folder) for split, folder in (folders or {"train": path}).items()}
+    if not any(scenes.values()):
         raise ImportFailure(f"{path}: {'no such file or folder' if not path.exists() else f'holds no *{ENDING}'}")
     notes = () if settings.frame_dt else (f"frame_dt is not in the source; {FRAME_DT:g} s is the format's usual one (frame_dt=…)",)
     facts = Facts(FRAME_DT, usual_gravity=GRAVITY, notes=notes).overridden(settings)
@@ -137,7 +137,10 @@ def _load(parts: list[Path], facts: Facts) -> Loaded:
             if name == "m":
                 nodes.mass = values
             else:
-                nodes.parameters = {"fluid": values}
+                if (values > 0).all():
+                    nodes.parameters = {"fluid": values}
+                else:
+                    nodes.notes.append("viscosity is 0, which cannot be stored: models take its logarithm (parameters={fluid: …})")
     if "grav" in first:
         gravity = _array(first, "grav", 0).astype(np.float64).ravel()
         _require_constant(frames, "grav", gravity)

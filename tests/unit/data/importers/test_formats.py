@@ -548,3 +548,17 @@ def test_the_canyon(tmp_path: Path) -> None:
 
 
 # --- own arrays ----------------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_viscosity_of_zero_and_an_empty_split_are_told(tmp_path: Path) -> None:
+    (tmp_path / "raw" / "valid").mkdir(parents=True)  # as after a download that failed
+    for k in range(4):
+        pos = motion(num_frames=12, dim=3, seed=k)
+        frames = sources.dmcf_frames(pos, np.gradient(pos, 0.02, axis=0))
+        for frame in frames:
+            frame["viscosity"] = sources.msgpack_array(np.zeros(pos.shape[1], np.float32))
+        sources.dmcf(tmp_path / "raw" / "train" / f"sim_{k}.msgpack.zst", frames)
+    report, stored = imported(tmp_path, tmp_path / "raw", "dmcf", parameters={"fluid": 0.02})
+    np.testing.assert_allclose(stored["train"][0].material_params, 0.02, rtol=1e-6)
+    assert any("viscosity is 0, which cannot be stored" in note for note in report.notes)
+    assert "val: the source has this split, and no trajectory in it; is the source complete?" in report.warnings
