@@ -162,6 +162,8 @@ def read(path: Path) -> Deck:
                 material = parameters["NAME"]
             elif keyword == "DENSITY":
                 deck.density[material] = float(lines[0][0])
+                if not deck.density[material] > 0:
+                    raise ValueError("must be positive")
             elif keyword == "ELASTIC":
                 deck.elastic[material] = _isotropic(parameters, lines)
             elif keyword == "BOUNDARY":

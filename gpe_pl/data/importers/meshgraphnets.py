@@ -45,6 +45,8 @@ from gpe_pl.schema import BOUNDARY
 NORMAL, HANDLE = 0, 3
 TYPES = {NORMAL: "elastomer", 1: "boundary", HANDLE: "elastomer", 6: "boundary"}
 NEEDED = ("world_pos", "mesh_pos", "cells", "node_type")
+LENGTH_RATIO = 3.0
+"""A warning is given if edges of cells are longer or shorter at rest than in the first frame by more than this factor."""
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
@@ -138,6 +140,16 @@ def _decoded(stored: tfrecord.Feature | None, name: str, feature: Mapping[str, A
     return array
 
 
+def _scale_warning(cells: np.ndarray, rest: np.ndarray, pos: np.ndarray) -> list[str]:
+    """Return a warning if cells at rest have a length that is far from that in the first frame."""
+    if not len(cells) or cells.dtype.kind not in "iu" or cells.min() < 0 or cells.max() >= len(pos):
+        return []  # refused later
+    at_rest, first = (float(np.median(np.linalg.norm(x[cells[:, 0]] - x[cells[:, 1]], axis=1))) for x in (rest, pos.astype(np.float64)))
+    if first / LENGTH_RATIO <= at_rest <= first * LENGTH_RATIO:
+        return []
+    return [f"edges of cells are {at_rest:.3g} m long in mesh_pos and {first:.3g} m in frame 0 of world_pos: are their units different?"]
+
+
 def _loaded(fields: Mapping[str, np.ndarray], length: int, settings: ImportSettings, facts: Facts) -> Loaded:
     pos, rest, cells, types = (fields[name] for name in NEEDED)
     for name in ("mesh_pos", "cells", "node_type"):
@@ -153,6 +165,7 @@ def _loaded(fields: Mapping[str, np.ndarray], length: int, settings: ImportSetti
     kind = ({3: "triangle", 4: "quadrilateral"} if is_sheet else {4: "tetrahedron", 8: "hexahedron"}).get(cells.shape[2])
     if kind is None:
         raise Refusal(f"cells have {cells.shape[2]} corners, which no kind of cell {'of a sheet ' if is_sheet else ''}has")
+    warnings += _scale_warning(cells[0], flat, pos[0])
     table = TYPES | {HANDLE: (settings.materials or {}).get(NORMAL, TYPES[NORMAL])}
     nodes = typed(pos, types[0, :, 0], table, settings, cells={kind: cells[0]}, rest_pos=flat, warnings=warnings)
     handles = (types[0, :, 0] == HANDLE) & (nodes.kind != BOUNDARY)

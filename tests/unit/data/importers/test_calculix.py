@@ -275,6 +275,7 @@ def test_damping_is_noted(tmp_path: Path) -> None:
         ),
         (lambda d: d.replace("AMPLITUDE=RISE", "AMPLITUDE=RISEE"), str, r"\*CLOAD cannot be read \(unknown amplitude 'RISEE'\)"),
         (lambda d: d.replace("*CLOAD, ", "*BOUNDARY, OP=NEW\nTIP, 3\n*CLOAD, "), str, r"\*BOUNDARY cannot be read \(OP=NEW releases nodes"),
+        (lambda d: d.replace("1200.\n", "0.\n"), str, r"\*DENSITY cannot be read \(must be positive\)"),
         (lambda d: d.replace("*ELASTIC\n", "*ELASTIC, TYPE=ORTHO\n"), str, r"\*ELASTIC cannot be read \(TYPE=ORTHO; only isotropic"),
         (lambda d: d.replace("2e6, 0.4\n", "2e6, 0.4, 20.\n1e6, 0.4, 90.\n"), str, "constants that depend on the temperature"),
         (lambda d: d.replace("2e6, 0.4\n", "2e6, 0.4\n*PLASTIC\n1e4, 0.\n"), str, r"\*PLASTIC gives a material another law"),

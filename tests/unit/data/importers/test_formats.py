@@ -284,6 +284,16 @@ def test_meshgraphnets(tmp_path: Path, container: str, as_boundary: bool) -> Non
     assert any("3 of 40 cells have boundary nodes" in event.what for event in report.repairs) == as_boundary
 
 
+def test_meshes_in_another_unit_are_told(tmp_path: Path) -> None:
+    for k in range(3):
+        cloth = sources.sheet(seed=k)
+        cloth["mesh_pos"] = 1000 * cloth["mesh_pos"]
+        sources.mgn_meta(tmp_path / "raw", cloth)
+        sources.mgn_tfrecord(tmp_path / "raw" / f"{SPLITS[k]}.tfrecord", [cloth])
+    report, _ = imported(tmp_path, tmp_path / "raw", "meshgraphnets")
+    assert any("are their units different?" in warning for warning in report.warnings)
+
+
 def test_a_mesh_of_tetrahedra(tmp_path: Path) -> None:
     points = np.argwhere(np.ones((3, 4, 3))) + np.random.default_rng(0).uniform(-0.2, 0.2, (36, 3))
     cells = Delaunay(points).simplices
