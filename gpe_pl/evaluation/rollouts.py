@@ -108,7 +108,9 @@ def evaluate(
             files.add(scene, about)
         files.finish()
         films += files.films
-    write_models(run_dir, members_of(simulator)[0], label, films, settings.export)  # first, as a run with metrics is finished
+    write_models(
+        run_dir, members_of(simulator)[0], label, films, settings.export
+    )  # before the metrics, because a run with metrics counts as finished
     write_cost(run_dir, predictor.seconds, frame_dt)
     write_rows(run_dir / "metrics.csv", rows)
     return rows

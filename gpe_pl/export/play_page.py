@@ -68,7 +68,9 @@ def write_page(
         raise PageFolderError("a page needs at least one model")
     folder = Path(folder)
     texts = {"play.js": bundled(), "play.css": (PARTS / "play.css").read_text(encoding="utf-8")}
-    scripts = [f"model_{number}.js" for number in range(len(simulators))]  # of a model's name a browser may make another address
+    scripts = [
+        f"model_{number}.js" for number in range(len(simulators))
+    ]  # names may have # or %, which browsers read as parts of an address
     for script, (name, simulator) in zip(scripts, simulators.items(), strict=True):
         texts[script] = _model_script(name, simulator, (films or {}).get(name, ()))
     materials = dict.fromkeys(simulator.builder.spec.materials[0] for simulator in simulators.values())

@@ -1,4 +1,4 @@
-"""Checks of places for results before work begins whose results would have no place."""
+"""Checks, before long work begins, that its results can be written."""
 
 from __future__ import annotations
 

@@ -77,11 +77,10 @@ class Design:
         """Return the pose, the distances and the cost, one a line."""
         from gpe_pl.evaluation.design.pose import text
 
-        lines = [f"best pose: {text(self.pose)}"]
-        if not any(self.pose):
-            lines = [
-                "best pose: that of the start, as no other that was tried is better; if the bodies do not reach the obstacle in time, raise seconds"
-            ]
+        none_is_better = (
+            "that of the start, as no other that was tried is better; if the bodies do not reach the obstacle in time, raise seconds"
+        )
+        lines = [f"best pose: {text(self.pose) if any(self.pose) else none_is_better}"]
         lines += [
             f"{name}: distance from the target {_in_metres(after)}, {_in_metres(before)} at the start"
             for name, (before, after) in self.distances.items()

@@ -168,7 +168,7 @@ def read(path: Path) -> Deck:
                 deck.elastic[material] = _isotropic(parameters, lines)
             elif keyword == "BOUNDARY":
                 if parameters.get("OP", "MOD") != "MOD":
-                    raise ValueError(f"OP={parameters['OP']} releases nodes; leave out what is held before the step instead")
+                    raise ValueError(f"OP={parameters['OP']} releases nodes that were held before; hold only nodes that stay held")
                 for node, axes in _held(lines, sets):
                     deck.held.setdefault(node, set()).update(axes)
             elif keyword == "CLOAD":

@@ -137,7 +137,7 @@ def _load(parts: list[Path], facts: Facts) -> Loaded:
             if name == "m":
                 nodes.mass = values
             else:
-                if (values > 0).all():
+                if values.any():
                     nodes.parameters = {"fluid": values}
                 else:
                     nodes.notes.append("viscosity is 0, which cannot be stored: models take its logarithm (parameters={fluid: …})")

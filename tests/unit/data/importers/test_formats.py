@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from gpe_pl.data.importers import ImportSettings, Report, import_dataset
+from gpe_pl.data.importers import ImportFailure, ImportSettings, Report, import_dataset
 from gpe_pl.data.importers.source import natural
 from gpe_pl.data.validate import validate
 from gpe_pl.schema import STICKY, node_code
@@ -572,3 +572,7 @@ def test_a_viscosity_of_zero_and_an_empty_split_are_told(tmp_path: Path) -> None
     np.testing.assert_allclose(stored["train"][0].material_params, 0.02, rtol=1e-6)
     assert any("viscosity is 0, which cannot be stored" in note for note in report.notes)
     assert "val: the source has this split, and no trajectory in it; is the source complete?" in report.warnings
+    negative = sources.msgpack_array(np.full(pos.shape[1], -0.01, np.float32))
+    sources.dmcf(tmp_path / "wrong" / "sim_0.msgpack.zst", [frame | {"viscosity": negative} for frame in frames])
+    with pytest.raises(ImportFailure, match="kinematic_viscosity = -0.01"):
+        imported(tmp_path / "other", tmp_path / "wrong", "dmcf")
