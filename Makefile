@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install fit test test-all fuzz physics check lint types contracts format-page format bench notebooks docs links clean
+.PHONY: help install fit smoke test test-slow test-all fuzz physics check lint types contracts format-page format bench notebooks docs links clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  %-12s %s\n", $$1, $$2}'
@@ -24,10 +24,17 @@ $(INSTALLED): pyproject.toml constraints.txt
 fit: install ## momentum ablation of the paper: generates data, trains, evaluates, reports (ARGS="size=tiny" and the like)
 	$(BIN)/python -m gpe_pl.fit experiment=ablation_momentum $(ARGS)
 
+smoke: install ## a miniature model from data to report, in a folder that is deleted afterwards
+	work=$$(mktemp -d) && trap 'rm -rf "$$work"' EXIT && \
+		$(BIN)/python -m gpe_pl.fit experiment=smoke paths.data="$$work/data" paths.runs="$$work/runs" $(ARGS)
+
 test: install ## fast tests on all cores (PYTEST_ARGS="-x" and the like for one)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-test-all: install ## all tests, analytic physics and notebooks included
+test-slow: install ## slower tests: whole commands, analytic physics, notebooks
+	$(BIN)/python -m pytest -m "(slow or notebook) and not long" $(PYTEST_ARGS)
+
+test-all: install ## all tests, also those that take minutes each
 	$(BIN)/python -m pytest -m "" $(PYTEST_ARGS)
 
 fuzz: install ## random states, scenes, graphs and files, thousands of each and others every time

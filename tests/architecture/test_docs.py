@@ -91,6 +91,7 @@ def test_help_names_every_choice(command: str) -> None:
         assert re.search(rf"^(?:\w+, )?{key}\b", listed, re.MULTILINE), f"{command} --help does not have {key}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["fit", "evaluate", "simulate", "identify", "benchmark", "convert"])
 def test_help_says_the_defaults(command: str) -> None:
     GlobalHydra.instance().clear()

@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 from tests.architecture.test_imports import MODULES, ROOT, dotted, syntax
 
 
@@ -39,6 +41,7 @@ def test_lines_without_an_encoding_are_found() -> None:
     assert list(without_encoding(ast.parse(source))) == [1, 3, 5, 6]
 
 
+@pytest.mark.slow
 def test_a_command_prints_utf8_in_a_latin_locale(tmp_path: Path) -> None:
     """The line has characters that Latin-1 lacks, and a name that is not UTF-8."""
     environment = {**os.environ, "PYTHONIOENCODING": "latin-1", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}

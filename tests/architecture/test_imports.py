@@ -56,6 +56,7 @@ def test_import_contracts() -> None:
     assert child.returncode == 0, child.stdout + child.stderr
 
 
+@pytest.mark.slow
 def test_data_can_be_read_and_made_without_torch() -> None:
     solvers = [dotted(path) for path in MODULES if "solvers" in path.parts]
     without = (
@@ -74,6 +75,7 @@ def test_data_can_be_read_and_made_without_torch() -> None:
 HEAVY = {"torch", "torch_geometric", "lightning", "torchmetrics", "numba", "scipy", "h5py", "matplotlib", "pandas", "rich", "wandb"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["fit", pytest.param("evaluate", marks=pytest.mark.slow)])
 def test_help_of_a_command_loads_nothing_heavy(command: str) -> None:
     """So that it takes what Hydra takes to compose a configuration, about a second, and no more."""
@@ -135,6 +137,7 @@ def top_level_imports(tree: ast.Module) -> set[str]:
     return names
 
 
+@pytest.mark.slow
 def test_no_optional_dependency_at_module_level() -> None:
     """Whoever installs the package without extras can import all of it."""
     required = {re.split(r"[<>=!~\[; ]", text, maxsplit=1)[0] for text in PROJECT["dependencies"]}
@@ -165,6 +168,7 @@ def test_ci_skips_nothing_for_a_missing_package(monkeypatch: pytest.MonkeyPatch)
         pytest.importorskip("no_such_package", reason="not installed")
 
 
+@pytest.mark.slow
 def test_imports_are_absolute_and_explicit() -> None:
     imports = [(dotted(path), node) for path in MODULES for node in ast.walk(syntax(path)) if isinstance(node, ast.ImportFrom)]
     assert imports
@@ -191,5 +195,6 @@ def later():
     assert top_level_imports(ast.parse(source)) == {"a", "c", "typing", "f", "g", "h"}
 
 
+@pytest.mark.slow
 def test_the_import_test_can_fail() -> None:
     assert "numpy" in loaded_by("gpe_pl.geometry.shapes")

@@ -156,6 +156,7 @@ def both(build: GraphBuilder, s: State) -> tuple[Any, Any]:
     return build(s), plain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize(("cls", "tolerance"), [(GraphBuilder, 1e-6), (DoubleBuilder, 1e-12)])
 def test_compiled_graphs_equal_plain_ones(scene: str, cls: type[GraphBuilder], tolerance: float) -> None:
@@ -205,6 +206,7 @@ def another(s: State) -> State:
     return replace(rest, gravity=1.5 * s.gravity[::-1], boundary=Boundary(**walls))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_standardized", [False, True])
 @pytest.mark.parametrize("scene", [name for name in SCENES if "cells " not in name and name != "cells"])
 def test_batches_in_one_pass_are_the_joined_graphs(scene: str, is_standardized: bool) -> None:
@@ -265,6 +267,7 @@ def test_changed_statistics_are_seen() -> None:
     torch.testing.assert_close(x[2].float(), x[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "settings", "static_friction"),
     [

@@ -255,6 +255,7 @@ def test_contacts_move_nothing_but_bodies() -> None:
     assert contact.num_hops == node.num_hops
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("materials", [BOTH, ("elastomer", "snow", "sand")])
 def test_bodies_beside_other_materials_need_something_that_keeps_the_sum(materials: tuple[str, ...]) -> None:
     spec = builder(materials).spec

@@ -64,6 +64,7 @@ def test_scenes_of_a_batch_move_as_alone(kind: str) -> None:
     assert not torch.allclose(simulated.step(states[0]).pos, states[0].pos + DT * states[0].vel, atol=1e-3 * scenes.SPACING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["triangles", "lattice", "tetrahedra"])
 @pytest.mark.parametrize(("is_double", "tolerance"), [(True, 1e-10), (False, 1e-5)])
 @pytest.mark.parametrize(("stiffness", "wall_layer"), [(0.0, 0.3), (2.0, 0.05)])  # cells with the second stiffness are softened
@@ -91,6 +92,7 @@ def test_the_compiled_motion_equals_the_plain_one(
         torch.testing.assert_close(value["solid"], other["solid"], rtol=0, atol=tolerance * float(other["solid"].abs().max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "softer", "speed", "first", "tries"),
     [("triangles", 1.5, 20.0, 23, 2), ("lattice", 1.0, 20.0, 3, 2), ("tetrahedra", 1.0, 100.0, MAX_SUBSTEPS, 4)],

@@ -234,6 +234,7 @@ def test_a_wrong_history_is_named() -> None:
         builder(history=3)(scenes.state(5, history=2).to_torch())
 
 
+@pytest.mark.slow
 def test_a_batch_numbers_nodes_as_its_graphs_do() -> None:
     build = builder(TWO)
     states = [

@@ -83,6 +83,7 @@ def test_oracle(new_trajectory: Callable[..., Trajectory], history: int) -> None
     np.testing.assert_allclose(result.vel, vel[history - 1 :], rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("features", ["paper", "contact"])
 @pytest.mark.parametrize("history", HISTORIES)
 def test_training_and_rollout_build_the_same_graph(
@@ -375,6 +376,7 @@ def test_a_file_of_torch_that_is_no_checkpoint_says_so(tmp_path: Path, content: 
         LearnedSimulator.from_checkpoint(tmp_path / "a.ckpt")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
@@ -401,6 +403,7 @@ def test_a_description_of_another_model_is_refused(simulator: LearnedSimulator, 
         LearnedSimulator.from_checkpoint(save(simulator, tmp_path / "a.ckpt", simulator={**description, key: value}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [

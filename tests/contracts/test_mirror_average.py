@@ -51,6 +51,7 @@ def averaged(learned: LearnedSimulator) -> LearnedSimulator:
     return learned.configured(mirror_average=True)
 
 
+@pytest.mark.slow
 def test_mirror_images_move_alike(scene: tuple[LearnedSimulator, Trajectory]) -> None:
     learned, trajectory = scene
     plain, mean = (mirror_equivariance_error(s, trajectory, START) for s in (learned, averaged(learned)))
@@ -113,6 +114,7 @@ def test_without_gravity_no_image_has_its_floor_above(scene: tuple[LearnedSimula
     assert len(floor.pos) > 0 and all((image.boundary.normal[:, 1] > 0.9).all() for image in seen)
 
 
+@pytest.mark.slow
 def test_checkpoints_store_it(scene: tuple[LearnedSimulator, Trajectory], tmp_path: Path) -> None:
     learned = scene[0]
     averaged(learned).save(tmp_path / "model.ckpt")

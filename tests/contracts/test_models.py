@@ -50,6 +50,7 @@ ON_MESHES = ("gpe-negated-node-latent", "gpe-odd-pair-geometry", "gpe-angular", 
 MAY_BE_UNUSED = ("updates", "lin_even", "pair_decoder", "boundary")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in USUAL else pytest.mark.slow) for name in MODELS])
 @pytest.mark.parametrize("check", CHECKS)
 def test_contract(check: str, name: str) -> None:
@@ -59,6 +60,7 @@ def test_contract(check: str, name: str) -> None:
         CHECKS[check](MODELS[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_MESHES)
 @pytest.mark.parametrize("check", MESH_CHECKS)
 def test_contract_on_meshes(check: str, name: str) -> None:

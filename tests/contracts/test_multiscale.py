@@ -437,6 +437,7 @@ def settings(request: pytest.FixtureRequest) -> dict[str, Any]:
     return VARIANTS[request.param]
 
 
+@pytest.mark.slow
 def test_relabelling_the_nodes_relabels_the_output(settings: dict[str, Any]) -> None:
     build = builder(BOTH)
     model = model_of(build, **settings)
@@ -478,6 +479,7 @@ def test_translation_changes_nothing(settings: dict[str, Any]) -> None:
     assert (z - y).norm() <= 1e-5 * y.norm()  # features are float32
 
 
+@pytest.mark.slow
 def test_batch_equals_singles_with_and_without_meshes(settings: dict[str, Any]) -> None:
     build = builder(BOTH)
     states = [
@@ -581,6 +583,7 @@ def test_particles_run_no_code_of_meshes() -> None:
     assert called != []
 
 
+@pytest.mark.slow
 def test_degenerate_meshes_are_finite_with_finite_gradients(settings: dict[str, Any]) -> None:
     build = builder(BOTH)
     s = scenes.mesh_state("triangles", BOTH)

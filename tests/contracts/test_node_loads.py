@@ -222,6 +222,7 @@ def test_loads_follow_their_nodes_into_parts_and_joined_states(tensors: bool) ->
 # --- models -------------------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sliding", [False, True])
 @pytest.mark.parametrize("law", list(LAWS))
 def test_a_rollout_takes_the_given_motion_exactly_and_computes_the_rest(law: str, sliding: bool) -> None:

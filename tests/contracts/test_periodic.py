@@ -204,6 +204,7 @@ def test_a_mesh_at_the_seam_is_the_mesh_inside(kind: str) -> None:
         assert_close_graphs(build(shifted(s, shift).to_torch()), inside, atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["triangles", "tetrahedra"])
 def test_rest_positions_that_were_folded_are_those_of_the_whole_mesh(kind: str) -> None:
     """Rest positions are folded if they come from a first frame in which a body lies across the seam. Also tests the exported program."""
@@ -330,6 +331,7 @@ def test_a_shift_changes_no_graph(periodic: tuple[bool, ...], features: Any) -> 
             assert torch.equal(other[m].island, data[m].island)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("periodic", AXES.values(), ids=AXES)
 @pytest.mark.parametrize("island_momentum", ["ignored", "angular"])
 def test_a_shift_changes_neither_step_nor_rollout(periodic: tuple[bool, ...], island_momentum: Any) -> None:

@@ -62,6 +62,7 @@ def distances(trajectory: Trajectory) -> list[np.ndarray]:
     return [np.stack([pdist(frame) for frame in trajectory.pos[:, trajectory.rigid_body == body]]) for body in (0, 1)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dim", "friction"), [(2, 0.3), (3, 0.0)])
 def test_a_contained_rollout_keeps_distances_and_both_paths_agree(dim: int, friction: float) -> None:
     truth = falling(dim)

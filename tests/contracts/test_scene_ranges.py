@@ -227,6 +227,7 @@ def test_the_range_is_that_of_all_training_trajectories(store: Path) -> None:
     assert boosted.trained_scene()[:, 4].tolist() == [0.0, 8.0]  # the wall that moved along x already
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", names())
 def test_shipped_models_know_their_gravity(name: str) -> None:
     simulator = LearnedSimulator.from_checkpoint(name)

@@ -47,6 +47,7 @@ def places(draw: Any, dtype: type) -> tuple[Periodicity, np.ndarray]:
     return space, np.stack([x, np.full_like(x, 0.5)], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_what_is_wrapped_is_inside_and_the_same_place(dtype: Any, backend: str) -> None:
@@ -281,6 +282,7 @@ def test_a_lid_whose_motion_does_not_know_the_seam_is_refused() -> None:
     fluid(Boundary.moving(way, np.tile([0.0, -1.0], (16, 1)), 0.01, periodicity=CHANNEL))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("normals", [True, False])
 def test_a_lid_in_a_file_slides_on_across_the_seam_of_that_file(tmp_path: Path, normals: bool) -> None:
     """The file gives the periodic axes, not the command line."""

@@ -216,6 +216,7 @@ def test_the_range_of_training_covers_all_parts(module: TrajectoryDataModule) ->
     assert len(module.val_trajectories(3)) == 3 and len({t.metadata.frame_dt for t in module.val_trajectories(3)}) == 2
 
 
+@pytest.mark.slow
 def test_unrolls_continue_with_the_frame_interval_of_their_scene(module: TrajectoryDataModule) -> None:
     simulator = learned(module.builder)
     simulator.fit_statistics(module.statistics_sample(), None, None, module.trained_scales())

@@ -87,6 +87,7 @@ def test_no_level_changes_a_mesh(level: str, kind: str) -> None:
     scenes.assert_equal_graphs(*(replace(build, skips=skips)(s) for skips in (one_level(level), NOTHING)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("decoder", ["node", "pair"])
 @pytest.mark.parametrize("edge_state", ["latent", "geometry"])
 @pytest.mark.parametrize(

@@ -120,6 +120,7 @@ def test_is_a_simulator(case):
     assert isinstance(case[0], Simulator)
 
 
+@pytest.mark.slow
 def test_same_input_gives_same_bytes(case):
     solver, state = case
     assert_same_bytes(run(solver, state, 40), run(solver, state, 40))

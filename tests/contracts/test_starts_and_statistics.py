@@ -146,6 +146,7 @@ UNBOUNDED = {
 PLACES = ("graph", "metadata", "format", "model", "static_friction")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("place", "kind"), [*(("settings", kind) for kind in UNBOUNDED), *((place, "tensor") for place in PLACES)])
 def test_what_a_checkpoint_says_is_bounded_before_it_is_looked_at(checkpoint: Path, tmp_path: Path, place: str, kind: str) -> None:
     value, message = UNBOUNDED[kind]

@@ -44,6 +44,7 @@ def check(model: str, data: str, *overrides: str) -> None:
         assert (cfg.graph.history, cfg.graph.connectivity_spacings) == (1, 2.25) and not training.noise.is_any
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", BASELINES)
 def test_the_recipe_wins_over_a_comparison(model: str) -> None:
     check(model, "elastomer", "experiment=table1", "size=small")
@@ -64,8 +65,8 @@ def test_a_model_without_a_recipe_is_refused() -> None:
     assert explain(ConfigError("other"), "fit", []) == "other"
 
 
-@pytest.mark.parametrize("data", ["sand", *(pytest.param(name, marks=pytest.mark.long) for name in DOMAINS[1:])])
-@pytest.mark.slow
+@pytest.mark.parametrize("data", DOMAINS)
+@pytest.mark.long
 def test_every_row_of_table_1_trains(tmp_path: Path, data: str) -> None:
     small = [each for each in DATA if "num_particles" not in each]
     generate(tmp_path / "data", dataset_spec(compose("simulate", *small, f"data={data}")), 1)

@@ -22,7 +22,6 @@ QUICK = {"smoke"}
 """Experiments that run with the fast tests."""
 SLOW = {
     "ablation_momentum",
-    "ablation_multiscale",
     "ladder",
     "mixed_materials",
     "table1",
@@ -51,6 +50,7 @@ def test_an_experiment_states_its_own_name(experiment: str) -> None:
     assert compose("fit", f"experiment={experiment}").name == experiment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", [e if e in QUICK else pytest.param(e, marks=_mark(e)) for e in EXPERIMENTS])
 def test_an_experiment_trains_and_evaluates(experiment: str, tiny_data: Path, tmp_path: Path) -> None:
     cfg = tiny(tiny_data, tmp_path, f"experiment={experiment}", *first_choices(experiment), *SHORT.get(experiment, []))

@@ -46,6 +46,7 @@ def assert_is_the_papers(cfg: DictConfig) -> None:
         assert (model["material_embedding"], model["island_momentum"], model["elastic"]) == ("affine", "ignored", False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", EXPERIMENTS[::4])  # the next test has all of them
 def test_the_recipe_wins_over_an_experiment(experiment: str) -> None:
     assert_is_the_papers(compose("fit", f"experiment={experiment}", "recipe=paper", "size=paper", *swept(experiment)[0]))
@@ -64,6 +65,7 @@ def test_the_recipe_wins_over_a_comparison(comparison: str) -> None:
     assert_is_the_papers(compose("fit", f"comparison={comparison}", "recipe=paper", "size=small", "model=gpe_tuned"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_each_domain_has_one_noise_at_all_sizes(domain: str) -> None:
     configs = [compose("fit", f"data={domain}", "recipe=paper", f"size={size}") for size in ("tiny", "small", "paper")]

@@ -48,6 +48,7 @@ def _param(path: Path) -> Any:
     return pytest.param(path, marks=() if "_".join(choices(path).values()) in USED else pytest.mark.slow, id=path.stem)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", [_param(path) for path in (*ALWAYS, *COMPARED)])
 def test_a_run_uses_the_values(path: Path) -> None:
     chosen = choices(path)
@@ -60,6 +61,7 @@ def test_a_run_uses_the_values(path: Path) -> None:
         assert OmegaConf.select(cfg, key) == value, key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("data", "model", "law", "is_elastic"), [
     ("fem", "gpe_tuned", "by_data", True),
     ("fem", "gpe_tuned", "none", False),

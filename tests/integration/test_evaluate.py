@@ -49,7 +49,7 @@ def key(row: Row) -> tuple[str, int, str, str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["gpe", *(pytest.param(m, marks=pytest.mark.slow) for m in ("gns", "dpinet", "cconv"))])
+@pytest.mark.parametrize("model", ["gpe", *(pytest.param(m, marks=pytest.mark.long) for m in ("gns", "dpinet", "cconv"))])
 def test_a_run_that_was_moved_gives_the_same_numbers(
     model: str, tiny_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -107,6 +107,7 @@ def test_several_checkpoints_are_one_ensemble_by_name(tmp_path: Path) -> None:
     assert compose("evaluate", "checkpoint=[sand]").name == "evaluation_sand_sand_test"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -147,6 +148,7 @@ def test_an_ensemble_is_calibrated_and_its_coverage_measured(tiny_data: Path, tm
     assert not [row for row in alone if row.metric == "fraction_in_bands"], "bands of an ensemble are not those of its member"
 
 
+@pytest.mark.slow
 def test_data_that_do_not_fit_are_refused_before_any_is_generated(checkpoint: Path, tmp_path: Path) -> None:
     with pytest.raises(
         SceneError, match=r"was trained with .* in 2D on sand; the scene has .* in 3D and sand; choose the data set with data="
@@ -184,6 +186,7 @@ def test_an_evaluation_that_fails_leaves_no_folder(tiny_data: Path, tmp_path: Pa
     assert not (tmp_path / "evaluation_test_unseen").exists()
 
 
+@pytest.mark.slow
 def test_a_shipped_model_is_named(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -81,6 +81,7 @@ def checkpoint(cfg: DictConfig, name: str = "last") -> dict[str, Any]:
     return torch.load(Path(cfg.paths.runs) / cfg.name / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("killed_at", "saved", "late"),
     [
@@ -153,6 +154,7 @@ def test_the_papers_recipe_trains_without_average_and_clipping(
     assert written["training"]["position_noise_of_domain"] == 5e-4 and written["training"]["gradient_clip"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -229,6 +231,7 @@ def test_a_run_killed_while_evaluating_trains_no_further(tiny_data: Path, tmp_pa
     assert not losses
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_left_as_it_is(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cfg = tiny(tiny_data, tmp_path)
     value = fit(cfg)
@@ -239,6 +242,7 @@ def test_a_finished_run_is_left_as_it_is(tiny_data: Path, tmp_path: Path, monkey
     assert {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in tmp_path.rglob("*") if p.is_file()} == files
 
 
+@pytest.mark.slow
 def test_a_failed_rollout_counts_in_a_search_as_in_tables(tiny_data: Path, tmp_path: Path) -> None:
     cfg = tiny(tiny_data, tmp_path, "evaluation.splits=[test]")
     value = fit(cfg)
@@ -305,6 +309,7 @@ def test_ctrl_c_says_how_to_go_on(tiny_data: Path, tmp_path: Path, monkeypatch: 
     assert (tmp_path / "fit" / "checkpoints" / "last.ckpt").exists()
 
 
+@pytest.mark.slow
 def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -362,6 +367,7 @@ def test_one_corrupted_batch_does_not_end_a_run(
     assert checkpoint(tiny(tiny_data, tmp_path, *STEPS))["global_step"] == 6
 
 
+@pytest.mark.slow
 def test_a_position_that_is_not_finite_stops_the_run_and_is_named(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The trajectory is read from disk, and was spoiled after training had checked all trajectories."""
     plain, spoiled = TrajectoryDataModule.train_dataloader, tmp_path / "shard-00000.h5"

@@ -44,6 +44,7 @@ def test_shipped_networks_equal_their_models(name: str, tmp_path: Path) -> None:
     assert onnx_network.difference(simulator, again, starts(simulator, 1)) <= TOLERANCE
 
 
+@pytest.mark.slow
 def test_a_network_that_differs_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     simulator = LearnedSimulator.from_checkpoint("sand")
     other = LearnedSimulator.from_checkpoint("sand")

@@ -22,6 +22,7 @@ OUTSIDE = (
 )
 
 
+@pytest.mark.slow
 def test_it_trains_and_its_checkpoint_needs_the_package(tiny_data: Path, tmp_path: Path) -> None:
     with outside.installed(outside.write(tmp_path / "site")):
         fit(tiny(tiny_data, tmp_path / "runs", "data=sand", "name=outside", *OUTSIDE, "evaluation.splits=[test]"))

@@ -79,6 +79,7 @@ def pixel(page: Any, x: float, y: float) -> tuple[float, float]:
     )
 
 
+@pytest.mark.slow
 def test_blocks_fall_when_the_page_plays(page: Any) -> None:
     assert page.locator("#rate").inner_text() in ("", "paused")  # the reader's system asks for reduced motion
     before = nodes(page)
@@ -89,6 +90,7 @@ def test_blocks_fall_when_the_page_plays(page: Any) -> None:
     page.wait_for_function("document.getElementById('kinetic').textContent !== '0 J'")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [{}, PHONE], indirect=True, ids=["desktop", "phone"])
 def test_everything_fits_and_buttons_are_large_enough(page: Any) -> None:
     width = page.viewport_size["width"]
@@ -96,6 +98,7 @@ def test_everything_fits_and_buttons_are_large_enough(page: Any) -> None:
     assert all(button.bounding_box()["height"] >= 40 for button in page.locator("button").all())
 
 
+@pytest.mark.slow
 def test_a_block_is_thrown_by_dragging(page: Any) -> None:
     x, y = nodes(page)[:, :2].max(axis=0) - 0.08
     held = np.hypot(*(nodes(page)[:, :2] - (x, y)).T) < 0.05
@@ -111,6 +114,7 @@ def test_a_block_is_thrown_by_dragging(page: Any) -> None:
     assert (nodes(page)[held, 0] < there).all()
 
 
+@pytest.mark.slow
 def test_the_keyboard_moves_an_obstacle(page: Any) -> None:
     def center() -> list[float]:
         return page.evaluate("gpePage.world.obstacles[0].center")
@@ -127,6 +131,7 @@ def test_the_keyboard_moves_an_obstacle(page: Any) -> None:
     assert center()[0] == pytest.approx(before[0], abs=0.01)
 
 
+@pytest.mark.slow
 def test_keys_add_remove_and_restart(page: Any) -> None:
     count = len(nodes(page))
     page.locator("#stage").focus()
@@ -144,6 +149,7 @@ def test_keys_add_remove_and_restart(page: Any) -> None:
     assert page.evaluate("gpePage.world.obstacles.length") == 1
 
 
+@pytest.mark.slow
 def test_the_slider_sets_the_parameter(page: Any) -> None:
     page.locator("#parameter-0").fill("0")
     low = LearnedSimulator.from_checkpoint("sand").get_buffer("trained_sand")[0, 0]
@@ -151,6 +157,7 @@ def test_the_slider_sets_the_parameter(page: Any) -> None:
     assert page.locator("#value-0").inner_text() == f"{float(low):.1f} °"
 
 
+@pytest.mark.slow
 def test_the_film_runs_beside_the_model(page: Any) -> None:
     assert page.locator("#film-side").is_hidden()
     page.locator("#model").select_option(label="other")
@@ -162,6 +169,7 @@ def test_the_film_runs_beside_the_model(page: Any) -> None:
     page.wait_for_function("document.getElementById('film-note').textContent === 'the film has ended'")
 
 
+@pytest.mark.slow
 def test_a_failed_model_stops_with_a_message(page: Any) -> None:
     page.evaluate("gpePage.world.state.vel[0] = NaN")
     advance(page, 2)
@@ -171,6 +179,7 @@ def test_a_failed_model_stops_with_a_message(page: Any) -> None:
     assert "failed" not in page.locator("#status").inner_text()
 
 
+@pytest.mark.slow
 def test_the_canvas_fits_a_phone_on_its_side(browser: Any, address: str) -> None:
     context = browser.new_context(viewport={"width": 740, "height": 340}, has_touch=True, is_mobile=True)
     opened = context.new_page()
@@ -181,6 +190,7 @@ def test_the_canvas_fits_a_phone_on_its_side(browser: Any, address: str) -> None
     context.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_a_scene_follows_the_size_of_the_domain(browser: Any, tmp_path: Path, factor: float) -> None:
     """A model of a box of 10 cm or 10 m: the same scene, smaller or larger."""
@@ -198,6 +208,7 @@ def test_a_scene_follows_the_size_of_the_domain(browser: Any, tmp_path: Path, fa
     opened.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["play", "a#1", "50%25", "<b>"])
 def test_a_model_may_have_any_name(browser: Any, tmp_path: Path, name: str) -> None:
     opened = browser.new_page(reduced_motion="reduce")
@@ -208,6 +219,7 @@ def test_a_model_may_have_any_name(browser: Any, tmp_path: Path, name: str) -> N
     opened.close()
 
 
+@pytest.mark.slow
 def test_a_page_without_its_model_says_so(browser: Any, tmp_path: Path) -> None:
     path = write_page(tmp_path, {"sand": LearnedSimulator.from_checkpoint("sand")})
     (tmp_path / "model_0.js").unlink()

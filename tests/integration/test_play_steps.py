@@ -114,6 +114,7 @@ def simulator(request: pytest.FixtureRequest) -> LearnedSimulator:
     return LearnedSimulator.from_checkpoint(request.param)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", OBSTACLES)
 def test_every_step_of_a_rollout_equals_that_of_the_simulator(simulator: LearnedSimulator, kind: str) -> None:
     state = scene(simulator, (FLOOR, SIDE, *OBSTACLES[kind]))
@@ -126,6 +127,7 @@ def test_every_step_of_a_rollout_equals_that_of_the_simulator(simulator: Learned
     assert np.abs(found["pos"] - np.stack([s.pos.numpy() for s in later])).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_a_rollout_differs_as_much_as_rounding_makes_it(simulator: LearnedSimulator) -> None:
     state = scene(simulator, (FLOOR, SIDE, *OBSTACLES["solids"]))
     exact = in_python(simulator, state, 50)[-1].pos.numpy()
@@ -135,6 +137,7 @@ def test_a_rollout_differs_as_much_as_rounding_makes_it(simulator: LearnedSimula
     assert error < 20 * max(of_rounding, 1e-9)
 
 
+@pytest.mark.slow
 def test_plain_loops_compute_the_same(simulator: LearnedSimulator) -> None:
     state = scene(simulator, (FLOOR, *OBSTACLES["solids"]))
     compiled, plain = (in_javascript(simulator, [state], 3, plain) for plain in (False, True))
@@ -142,6 +145,7 @@ def test_plain_loops_compute_the_same(simulator: LearnedSimulator) -> None:
     assert np.abs(compiled["pos"] - plain["pos"]).max() < 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", OBSTACLES)
 def test_boundary_nodes_lie_where_python_puts_them(kind: str) -> None:
     simulator = LearnedSimulator.from_checkpoint("sand")
@@ -155,6 +159,7 @@ def test_boundary_nodes_lie_where_python_puts_them(kind: str) -> None:
     np.testing.assert_allclose(rows(found["boundary"], found["normal"]), rows(state.boundary.pos, state.boundary.normal), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["elastomer", "fem", "fluid"])
 def test_other_models_are_refused_with_what_the_page_computes(name: str) -> None:
     with pytest.raises(PageError, match="particles in 2D, and not a model"):

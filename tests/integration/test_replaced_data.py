@@ -100,6 +100,7 @@ def test_a_run_knows_its_data_by_what_they_hold(tmp_path: Path, monkeypatch: pyt
         fit(other)
 
 
+@pytest.mark.slow
 def test_new_test_data_alone_are_noticed(tmp_path: Path) -> None:
     imported(tmp_path / "data", 9.81)
     run = config("fit", tmp_path, "evaluation.splits=[test]", "name=run")
@@ -125,6 +126,7 @@ def test_statistics_of_other_data_are_not_used(tmp_path: Path) -> None:
     assert before["acceleration_std"] > 0
 
 
+@pytest.mark.slow
 def test_generated_statistics_follow_their_shards(tmp_path: Path) -> None:
     root = generate_tiny(tmp_path) / "sand" / "tiny"
     before = json.loads((root / "statistics.json").read_text())

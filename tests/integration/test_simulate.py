@@ -36,19 +36,19 @@ def checked(folder: Path, num_trajectories: int) -> None:
 @pytest.mark.parametrize(
     ("arguments", "name"),
     [
-        (["data=sand", "dimension=3"], "sand_3d"),
+        pytest.param(["data=sand", "dimension=3"], "sand_3d", marks=pytest.mark.long),
         pytest.param(["data=snow", "dimension=3"], "snow_3d", marks=pytest.mark.long),
         pytest.param(["data=elastomer", "dimension=3"], "elastomer_3d", marks=pytest.mark.long),
-        (["data=mixed"], "mixed"),
+        pytest.param(["data=mixed"], "mixed", marks=pytest.mark.long),
         (["data=mixed", "dimension=3"], "mixed_3d"),
-        (["data=snow_on_liquid"], "snow_on_liquid"),
+        pytest.param(["data=snow_on_liquid"], "snow_on_liquid", marks=pytest.mark.long),
         pytest.param(["data=snow_on_liquid", "dimension=3"], "snow_on_liquid_3d", marks=pytest.mark.long),
         (["data=fluid", "dimension=2"], "fluid_2d"),
         pytest.param(["data=fluid", "scene=dam_break"], "fluid_dam_break", marks=pytest.mark.long),
-        (["data=fluid", "scene=dam_break", "dimension=2"], "fluid_dam_break_2d"),
+        pytest.param(["data=fluid", "scene=dam_break", "dimension=2"], "fluid_dam_break_2d", marks=pytest.mark.long),
         (["data=fluid", "scene=canyon"], "fluid_canyon"),
         (["data=fem", "dimension=3"], "fem_3d"),
-        (["data=fem", "data.scene.cell=quad", "data.name=fem_quad"], "fem_quad"),
+        pytest.param(["data=fem", "data.scene.cell=quad", "data.name=fem_quad"], "fem_quad", marks=pytest.mark.long),
     ],
 )
 def test_every_variant(tmp_path: Path, arguments: list[str], name: str) -> None:

@@ -61,6 +61,7 @@ def opened(browser: Any, tmp_path: Path) -> Iterator[Any]:
         viewer.page.close()
 
 
+@pytest.mark.slow
 def test_particles_fall_as_time_passes(opened: Any) -> None:
     viewer = opened(falling(2), GPE=falling(2, noise=0.3))
     first = [viewer.colored(panel)[:, 0].mean() for panel in range(3)]
@@ -70,6 +71,7 @@ def test_particles_fall_as_time_passes(opened: Any) -> None:
     assert viewer.page.locator("#time").inner_text().startswith("0.22 s   frame 11\nerror ")
 
 
+@pytest.mark.slow
 def test_it_plays_to_the_end_and_begins_again(opened: Any) -> None:
     viewer = opened(falling(3), GPE=falling(3, noise=0.3))
     viewer.page.locator("#stage").focus()
@@ -87,6 +89,7 @@ def test_it_plays_to_the_end_and_begins_again(opened: Any) -> None:
     assert viewer.page.get_attribute("#play", "aria-label") == "play"
 
 
+@pytest.mark.slow
 def test_it_does_not_step_back_when_it_begins_to_play(opened: Any) -> None:
     """A picture that the browser began before the click has an earlier time."""
     viewer = opened(falling(3), GPE=falling(3, noise=0.3))
@@ -108,6 +111,7 @@ def test_it_does_not_step_back_when_it_begins_to_play(opened: Any) -> None:
     assert viewer.page.evaluate("() => window.lowest") == 6
 
 
+@pytest.mark.slow
 def test_colours_mean_what_is_chosen(opened: Any) -> None:
     truth = falling(2)
     viewer = opened(replace(truth, node_type=np.full(truth.num_nodes, node_code("snow"), np.uint8)))
@@ -119,6 +123,7 @@ def test_colours_mean_what_is_chosen(opened: Any) -> None:
     assert viewer.page.locator(".bar").inner_text().split("\n")[:2] == ["0 m/s", "speed"]
 
 
+@pytest.mark.slow
 def test_a_mesh_is_coloured_by_its_stress(opened: Any, mesh: Trajectory) -> None:
     assert mesh.stress is not None
     node = np.zeros_like(mesh.stress.node)
@@ -133,6 +138,7 @@ def test_a_mesh_is_coloured_by_its_stress(opened: Any, mesh: Trajectory) -> None
     assert viewer.page.locator(".bar").inner_text().split("\n")[1] == "von Mises stress"
 
 
+@pytest.mark.slow
 def test_a_colour_bar_marks_values_above_its_end(opened: Any) -> None:
     truth = falling(2)
     vel = np.ones_like(truth.vel)
@@ -142,6 +148,7 @@ def test_a_colour_bar_marks_values_above_its_end(opened: Any) -> None:
     assert viewer.page.locator(".bar").inner_text().split("\n") == ["0 m/s", "speed", "≥ 1.41 m/s"]
 
 
+@pytest.mark.slow
 def test_panels_say_how_many_nodes_they_do_not_show(opened: Any) -> None:
     truth = falling(2)
     pos = truth.pos.copy()
@@ -154,6 +161,7 @@ def test_panels_say_how_many_nodes_they_do_not_show(opened: Any) -> None:
     assert "rms" in viewer.page.locator("#time").inner_text()
 
 
+@pytest.mark.slow
 def test_cells_do_not_stretch_across_a_periodic_domain(opened: Any) -> None:
     mesh = falling_mesh(2)
     metadata = replace(mesh.metadata, periodic=(True, False))
@@ -164,6 +172,7 @@ def test_cells_do_not_stretch_across_a_periodic_domain(opened: Any) -> None:
     assert (np.ptp(picture, axis=-1) > 40).sum() > 500 and (np.ptp(between, axis=-1) > 40).sum() == 0
 
 
+@pytest.mark.slow
 def test_predictions_take_turns_and_one_that_stopped_says_why(opened: Any) -> None:
     truth, other = falling(2), falling(2, noise=0.3)
     stopped = replace(other.frames(0, 7), termination=Termination("explosion", 7, 0, "frame 7: too fast"))
@@ -177,6 +186,7 @@ def test_predictions_take_turns_and_one_that_stopped_says_why(opened: Any) -> No
     assert len(viewer.colored(0)) > 100 and len(viewer.colored(1)) == 0
 
 
+@pytest.mark.slow
 def test_the_mouse_finds_a_node_in_every_panel_and_turns_a_scene(opened: Any) -> None:
     viewer = opened(falling(3), GPE=falling(3, noise=0.3))
     row, column = viewer.colored(0).mean(axis=0)
@@ -197,6 +207,7 @@ def mesh(request: pytest.FixtureRequest) -> Trajectory:
     return falling_mesh(request.param)
 
 
+@pytest.mark.slow
 def test_two_predictions_are_a_distance_apart(opened: Any) -> None:
     truth, other = falling(2), falling(2, noise=0.3)
     first, second = replace(truth, is_prediction=True), replace(other, is_prediction=True, material_params=truth.material_params + 10)
@@ -207,6 +218,7 @@ def test_two_predictions_are_a_distance_apart(opened: Any) -> None:
     assert viewer.page.locator("#materials").inner_text() == "sand"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [360, 414])
 def test_colour_bars_are_below_the_pictures_on_a_phone(opened: Any, width: int) -> None:
     truth = falling(2)

@@ -33,7 +33,9 @@ def effective_viscosity(solver, viscosity, decay):
     return math.log(amplitudes[0] / amplitudes[1]) / (num_frames * solver.frame_dt * wave**2)
 
 
-@pytest.mark.parametrize(("size", "dim"), [("tiny", 2), ("small", 2), ("paper", 2), ("tiny", 3), ("paper", 3)])
+@pytest.mark.parametrize(
+    ("size", "dim"), [("tiny", 2), ("small", 2), ("tiny", 3), *(pytest.param("paper", dim, marks=pytest.mark.long) for dim in (2, 3))]
+)
 def test_effective_viscosity(size, dim, physics):
     """The nominal one and the grid's own add up; 3D is small and tiny on the same grid."""
     spec = dataset("data=fluid", f"size={size}", f"dimension={dim}")

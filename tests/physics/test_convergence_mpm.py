@@ -80,7 +80,9 @@ def test_settled_snow(size, dim, physics):
         physics(f"height of the centre of settled snow, ξ = {hardening:g}", own, half, 0.03, formula=formula, source=source, unit="m")
 
 
-@pytest.mark.parametrize(("size", "dim"), [("tiny", 2), ("small", 2), ("paper", 2), ("tiny", 3)])
+@pytest.mark.parametrize(
+    ("size", "dim"), [("tiny", 2), *(pytest.param(*case, marks=pytest.mark.long) for case in (("small", 2), ("paper", 2), ("tiny", 3)))]
+)
 def test_effective_viscosity_of_liquid_under_snow(size, dim, physics):
     """The effective viscosity of the data's thinnest liquid is the nominal one plus that of the grid. Shorter steps do not raise it."""
     spec: Any = dataset("data=snow_on_liquid", f"size={size}", f"dimension={dim}")

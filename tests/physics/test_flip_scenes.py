@@ -42,6 +42,7 @@ RELEASE = 0.175
 """Time, in √(a/2g), by which an ideal release leads the experiment: the value that the finite elements of Lethe use for the same records."""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DAM_BREAK.exists(), reason="needs the measured dam-break front")
 def test_dam_break(physics):
     """A column twice as high as wide. The front, at the floor, against both series of Martin and Moyce, with their clock and with a later release.
@@ -158,7 +159,11 @@ def caps(radius, spacing, count):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "cells", "count", "limits"),
-    [("tiny", 10, 500, (0.03, 0.15)), ("small", 12, 1200, (0.02, 0.08)), ("paper", 18, 4000, (0.02, 0.02))],
+    [
+        ("tiny", 10, 500, (0.03, 0.15)),
+        ("small", 12, 1200, (0.02, 0.08)),
+        pytest.param("paper", 18, 4000, (0.02, 0.02), marks=pytest.mark.long),
+    ],
 )
 def test_volume_at_rest_in_the_bowl_of_the_data(physics, size, cells, count, limits):
     """Scenes of ``data=fluid`` after the liquid has come to rest; its volume in two ways, the worst of two scenes.
@@ -203,6 +208,7 @@ def test_numerical_viscosity(physics, frame_dt):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_no_particle_passes_a_curved_wall(physics, dim):
     """Liquid shot at 10 m/s at a ball, a box and the wall of a round container."""
@@ -220,6 +226,7 @@ def test_no_particle_passes_a_curved_wall(physics, dim):
     physics(f"depth of particles in curved walls in {dim}D", deepest, 1e-9, kind="at_most", formula="φ >= 0", source="exact", unit="m")
 
 
+@pytest.mark.slow
 def test_self_convergence_of_a_collapse(physics):
     """A viscous column that collapses: height of its centre of mass after 0.5 s on three grids, and with three time steps."""
 

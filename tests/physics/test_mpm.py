@@ -248,7 +248,7 @@ def vortex_decay(viscosity, cells, dim=2):
 VORTEX = {"formula": "2 ν π²", "source": "Taylor and Green 1937, exact solution of Navier-Stokes", "unit": "1/s"}
 
 
-@pytest.mark.parametrize(("viscosity", "cells", "dim"), [(0.1, 32, 2), (0.5, 32, 2), (0.5, 32, 3)])
+@pytest.mark.parametrize(("viscosity", "cells", "dim"), [(0.1, 32, 2), (0.5, 32, 2), pytest.param(0.5, 32, 3, marks=pytest.mark.long)])
 def test_a_vortex_decays_by_the_viscosity(viscosity, cells, dim, physics):
     physics(f"decay rate, {dim}D, ν = {viscosity}", vortex_decay(viscosity, cells, dim), 2 * viscosity * math.pi**2, 0.05, **VORTEX)
 
@@ -385,6 +385,7 @@ def test_run_out_grows_with_the_aspect_ratio(run_outs, physics):
         physics(f"ΔL at H/L = {high:g} over {low:g}, {angle:g}°", ratio, 1.3, formula="monotone", source=LUBE, kind="at_least")
 
 
+@pytest.mark.long
 def test_run_out_follows_the_scaling_of_experiments(physics):
     """Sand, here the front on a grid of L0/25 at 40°.
 

@@ -39,6 +39,7 @@ def test_a_misspelt_verb_gets_the_one_that_was_meant(monkeypatch: pytest.MonkeyP
     assert capsys.readouterr().err.startswith("error: gpe 'dmeo': unknown verb; did you mean 'demo'?; verbs: ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "words"),
     [

@@ -204,6 +204,7 @@ def test_energy_distance_by_hand():
     assert energy_distance(a, b, np.array([3.0, 1.0]), np.ones(1)) == pytest.approx(1.25)
 
 
+@pytest.mark.slow
 def test_energy_distance_in_blocks_equals_all_pairs_and_ignores_order():
     rng = np.random.default_rng(1)
     a, b = rng.normal(size=(2100, 2)), rng.normal(0.3, 1.0, size=(2500, 2))  # more than one block of rows

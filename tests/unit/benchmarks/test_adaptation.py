@@ -31,6 +31,7 @@ def candidates() -> dict[EngineName, Candidate]:
     return {engine: candidate_of(checkpoint, specs) for engine, checkpoint in ENGINES.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ENGINES)
 def test_random_scenes_are_inside_the_walls_and_the_trained_range(name: EngineName, candidates: dict[EngineName, Candidate]) -> None:
     candidate = candidates[name]
@@ -97,6 +98,7 @@ def test_velocities_and_stress_of_an_engine_are_stored_with_its_scenes(
             assert (trajectory.vel == 3.0).all()
 
 
+@pytest.mark.slow
 def test_scenes_that_cannot_be_used_leave_no_data_set(
     tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,6 +119,7 @@ def settings(**changes: Any) -> suite.Settings:
     return suite.Settings(cases={}, engines=of_engine, **{"num_train": 2, "num_val": 1, "num_test": 2, **changes})  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_what_is_trained_and_compared(tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch) -> None:
     run, _ = engine_that_slides(0.1, given_up=[3])
     with_engine(monkeypatch, "kratos", run)

@@ -15,6 +15,7 @@ from gpe_pl.data.ground_truth import initial_state
 from gpe_pl.rollout.loop import SimulationError, steps
 
 
+@pytest.mark.slow
 def test_distances_are_those_of_the_solutions_at_the_given_times() -> None:
     spec = dataset("data=elastomer", "size=tiny")
     records = scene_records(spec, "elastomer", "test", 1, [0.05, 0.1])

@@ -29,7 +29,7 @@ def test_ratios_are_relative_to_the_first_length(monkeypatch: pytest.MonkeyPatch
     assert "| 2 | 10 | 10 | 1.01 |" in table
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_gradient_keeps_no_graph_of_each_frame() -> None:
     """With all graphs, 60 frames of this scene take about 200 MB."""
     records, _ = run(Settings(CASES, {"sand": "sand"}, lengths=[160]), {"sand": dataset(*CASES["sand"].overrides)})

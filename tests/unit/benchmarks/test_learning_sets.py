@@ -113,6 +113,7 @@ def falls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "files"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("averages", [None, True])
 def test_every_split_is_trained_and_measured_once(
     averages: bool | None, tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch
@@ -152,6 +153,7 @@ def test_every_split_is_trained_and_measured_once(
     assert {*averaged} == {bool(averages)}
 
 
+@pytest.mark.slow
 def test_a_training_that_fails_names_its_command(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
     with pytest.raises(
@@ -191,6 +193,7 @@ def test_the_definition_of_the_digest_is_that_of_the_published_ones(tmp_path: Pa
     assert suite.digest_of(tmp_path) == sha256("".join(lines).encode()).hexdigest()
 
 
+@pytest.mark.slow
 def test_files_with_other_values_than_the_published_ones_are_refused(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = falls / "data_FluidFall"
     monkeypatch.setitem(SETS, "fluidfall", replace(SETS["fluidfall"], digest=suite.digest_of(files)))
@@ -206,6 +209,7 @@ def test_files_with_other_values_than_the_published_ones_are_refused(tmp_path: P
         suite.run(settings, tmp_path / "others")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -225,6 +229,7 @@ def test_files_that_are_not_the_published_ones_are_refused(
     assert not (tmp_path / "runs" / "data" / "fluidfall_without_0" / "imported").exists()
 
 
+@pytest.mark.slow
 def test_files_that_changed_after_the_import_are_refused(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
     settings = suite.Settings(str(falls), only=["fluidfall"], num_splits=1)

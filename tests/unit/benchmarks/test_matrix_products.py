@@ -49,6 +49,7 @@ def of(spec: Any, **variant: Any) -> GPE:
     return GPE(spec, **{"num_message_passing_steps": 3, "hidden_channels": 8, **variant})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS, ids=str)
 def test_of_particles_and_meshes(variant: dict[str, Any]) -> None:
     particles = of(scenes.builder(("sand", "snow")).spec, **variant), scenes.graph(("sand", "snow"), torch.float32)

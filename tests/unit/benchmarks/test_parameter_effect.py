@@ -123,6 +123,7 @@ def test_every_domain_has_a_case_for_both_splits() -> None:
     assert given == today | {f"{name}_paper": [f"data={name}", "parameters=paper"] for name in DOMAINS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("data", DOMAINS)
 def test_the_papers_split_trains_the_ends(data: str) -> None:
     today, paper = (dataset(f"data={data}", "size=small", *more) for more in ([], ["parameters=paper"]))

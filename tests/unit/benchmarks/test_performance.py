@@ -72,6 +72,7 @@ def test_an_unknown_case_of_several_scenes_is_named() -> None:
         performance.run(Settings({"sand": Case([])}, "snow"), {"sand": dataset("data=sand", "size=small")}, {})
 
 
+@pytest.mark.slow
 def test_several_scenes_are_rolled_out_together(monkeypatch: pytest.MonkeyPatch) -> None:
     def fall(spec: DatasetSpec, split: str, index: int, num_frames: int) -> Trajectory:
         start = initial_state(spec, split, index)

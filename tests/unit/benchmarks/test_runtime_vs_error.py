@@ -132,6 +132,7 @@ def untrained(stride: int = 1) -> LearnedSimulator:
     return LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder, stride)
 
 
+@pytest.mark.slow
 def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
     settings = Settings({}, [], factors=[2.0], step_factors=[2], num_trajectories=1, horizons=[10, 21, 40])  # a rollout has 21 frames
@@ -146,6 +147,7 @@ def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     assert np.isfinite(found.order) and not found.partial
 
 
+@pytest.mark.slow
 def test_a_model_with_longer_frames_starts_with_the_others_and_is_seen_at_all_frames() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
     models = {"every": Entrant(untrained(), Spent(0.0)), "third": Entrant(untrained(3), Spent(0.0))}  # before training they fall freely
@@ -250,6 +252,7 @@ def test_nothing_to_compare_says_so(tmp_path: Path) -> None:
         run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec}, tmp_path)
 
 
+@pytest.mark.slow
 def test_the_suite_also_has_scenes_of_2500_nodes_at_the_spacing_of_the_small_ones() -> None:
     cases = {name: dataset(*case.overrides) for name, case in compose("benchmark", "suite=runtime_vs_error").suite.cases.items()}
     for material in ("sand", "snow"):
@@ -326,6 +329,7 @@ def test_a_reference_is_computed_once_for_each_scene_and_solver(monkeypatch: pyt
         stored_reference(replace(spec, fine=4), "test", 0, tmp_path)
 
 
+@pytest.mark.slow
 def test_models_of_other_labels_of_the_same_scenes_take_part(tmp_path: Path) -> None:
     spec = dataset_spec(compose("simulate", "data=snow", "size=tiny", "data.fine=2"))
     modulus = spec.solver.constants_of("snow").youngs_modulus  # type: ignore[attr-defined]
@@ -352,6 +356,7 @@ def test_models_of_other_labels_of_the_same_scenes_take_part(tmp_path: Path) -> 
     assert {label: e.teacher for label, e in plain.items()} == {"GPE 1 × 8": DATA}
 
 
+@pytest.mark.slow
 def test_a_shipped_model_takes_part_in_the_case_of_its_data() -> None:
     settings = Settings({}, [], repeats=[], checkpoints=["snow", "sand"])
     small = dataset_spec(compose("simulate", "data=snow", "size=small"))

@@ -29,6 +29,7 @@ def test_a_power_law_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     assert figures(records)["scaling"].axes[0].get_ylabel() == "time of a step [s]"
 
 
+@pytest.mark.slow
 def test_large_scenes_are_also_timed_with_nodes_as_they_come(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scaling, "peak_memory", lambda *_: 1000)
     monkeypatch.setattr(scaling, "paired_times", lambda found, _: {name: np.full(3, 2.0 + k) for k, name in enumerate(found)})

@@ -13,6 +13,7 @@ from tests.runs import compose
 TINY = ["size=tiny", "data.sizes.tiny.num_train=3", "data.sizes.tiny.num_frames=5"]
 
 
+@pytest.mark.slow
 def test_every_configured_case_is_a_data_set():
     suite: Any = OmegaConf.to_container(OmegaConf.load(CONF / "suite" / "solvers.yaml"))
     cases = suite["cases"]

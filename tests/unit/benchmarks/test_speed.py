@@ -27,6 +27,7 @@ def test_the_lattice_has_about_the_wanted_edges(dim: int, num_nodes: int, num_ed
     assert graph["sand"].x.shape[0] == num_nodes and builder.spec.dim == dim
 
 
+@pytest.mark.slow
 def test_a_scene_larger_than_the_sample_that_its_radius_comes_from() -> None:
     builder, graph = lattice_graph(50_000, 250_000, GraphConfig(history=1))
     assert abs(sum(graph[r].edge_index.shape[1] for r in builder.spec.relations) - 250_000) < 0.02 * 250_000

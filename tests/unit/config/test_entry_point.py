@@ -123,6 +123,7 @@ def complaint(name: str, *overrides: str) -> str:
     return explain(caught.value, name, list(overrides))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "override", "words"),
     [
@@ -199,6 +200,7 @@ def test_a_misspelling_beside_a_sweep_gets_the_valid_ones() -> None:
 # --- values, by the entry points' own checks -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -233,12 +235,14 @@ def test_fit_names_the_value_before_it_does_anything(override: str, message: str
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["gpe_pl.models.gpe.GEP", "os.system", "3"])
 def test_fit_takes_only_models(target: str, tmp_path: Path) -> None:
     with pytest.raises(UnknownModelError, match=f"model '{target}'"):
         fit(compose("fit", f"model._target_='{target}'", f"paths.data={tmp_path}", f"paths.runs={tmp_path}"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -273,6 +277,7 @@ def call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: Callable[[DictCo
     entry_point("benchmark")(task)()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suite", ["speed", "scaling", "skip", "runtime_vs_error"])
 def test_a_suite_for_a_gpu_says_that_there_is_none(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, suite: str
@@ -283,6 +288,7 @@ def test_a_suite_for_a_gpu_says_that_there_is_none(
     assert capsys.readouterr().err.startswith("error: trainer=gpu: PyTorch finds no GPU here")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "arguments", "line"),
     [
@@ -393,6 +399,7 @@ def test_without_hydra_the_output_lies_under_runs(tmp_path: Path) -> None:
     assert output_dir(OmegaConf.create({"paths": {"runs": str(tmp_path)}, "name": "x"})) == tmp_path / "x"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "arguments", "line"),
     [

@@ -21,6 +21,7 @@ def test_a_training_has_all_pairs_of_spacing_and_stride() -> None:
     assert [spec.scene.spacing / base.scene.spacing for spec in specs] == pytest.approx([0.5, 0.5, 2, 2, 1.5])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 3])
 def test_a_part_is_the_data_set_of_the_same_factor(factor: float) -> None:
     cfg = compose("fit", "graph.scales=dimensional", f"data.scales={{spacing_factors: [{factor}], strides: [1]}}")
@@ -33,6 +34,7 @@ def test_without_scales_a_training_has_its_own_data() -> None:
     assert training_parts(cfg) == [cfg] and dataset_spec(cfg).name == "sand"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -50,6 +52,7 @@ def test_what_cannot_be_is_refused(overrides: tuple[str, ...], message: str) -> 
         evaluated_config(cfg)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scaling", [(), ("scaling=specialist",), ("scaling=general",)])
 @pytest.mark.parametrize("data", ["fem", "fluid", "channel"])
 def test_the_experiment_is_refused_at_once_for_data_of_one_spacing(data: str, scaling: tuple[str, ...]) -> None:

@@ -116,6 +116,7 @@ def test_failed_trials_are_left_out_and_a_sweep_of_nothing_else_ends(tmp_path: P
         sweeper(tmp_path / "other", Launcher(failing="gns")).sweep(["model=gns"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [math.nan, math.inf, None])
 def test_trials_without_a_finite_value_count_and_are_left_out(tmp_path: Path, value: float | None) -> None:
     launcher = Launcher(other={"gns": value})

@@ -24,6 +24,7 @@ def unresolved(*overrides: str, hydra_config: bool = False) -> DictConfig:
         return hydra.compose("fit", [*overrides], return_hydra_config=hydra_config)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("beside", "typed", "because"),
     [
@@ -55,6 +56,7 @@ def test_what_only_unread_keys_read_is_refused() -> None:
     assert refusal == "model.wall_damping=0.3: has no effect with model.elastic=False; leave out one of the two"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("beside", "typed"),
     [
@@ -73,8 +75,8 @@ def test_what_is_read_is_not(beside: str, typed: str) -> None:
     assert without_effect(unresolved(beside, typed), [beside, typed]) == ""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("experiment", [pytest.param(e, marks=pytest.mark.long if e.startswith("tuning") else ()) for e in EXPERIMENTS])
+@pytest.mark.long
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_with_the_papers_recipe_too_an_axis_changes_something_or_is_refused(experiment: str) -> None:
     params: dict[str, Any] = unresolved(f"experiment={experiment}", hydra_config=True).hydra.sweeper.params or {}
     axes = [[f"{key}={value}" for value in str(values).split(",")] for key, values in params.items() if key != "seed"]

@@ -36,6 +36,7 @@ def test_a_chosen_scene_is_that_of_the_pool() -> None:
     assert scene_seed(own, "val", 0) == scene_seed(pool, "val", 0)
 
 
+@pytest.mark.slow
 def test_a_data_set_grows_and_keeps_its_scenes(tmp_path: Path) -> None:
     folder = generate(tmp_path, spec())
     first = (folder / "train" / "shard-00000.h5").read_bytes()
@@ -52,6 +53,7 @@ def test_a_data_set_grows_and_keeps_its_scenes(tmp_path: Path) -> None:
     assert stored_scenes(tmp_path, spec("data.num_train=10")) == [0, 1, 7, 5]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "other", [{"num_train": 4, "train_scenes": (0, 2, 7, 5)}, {"num_train": 4}, {"num_train": 1, "train_scenes": (0,)}]
 )
@@ -61,6 +63,7 @@ def test_other_scenes_are_refused(tmp_path: Path, other: dict[str, object]) -> N
         generate(tmp_path, spec(**other))
 
 
+@pytest.mark.slow
 def test_a_data_set_with_other_settings_does_not_grow(tmp_path: Path) -> None:
     generate(tmp_path, spec())
     with pytest.raises(GenerationError, match="seed is 0, now 1"):
@@ -79,6 +82,7 @@ def test_as_many_different_scenes_as_trajectories(scenes: tuple[int, ...]) -> No
         spec(train_scenes=scenes)
 
 
+@pytest.mark.slow
 def test_commands_take_the_chosen_scenes(tmp_path: Path) -> None:
     chosen_scenes.write(tmp_path / "sand" / "tiny", [Choice([0, 1], [], 0, 0, [], 0.0), CHOICE])
     folders = f"paths.data={tmp_path}"

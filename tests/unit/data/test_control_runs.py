@@ -68,6 +68,7 @@ def test_runs_branch_off_the_ground_truth(sand: DatasetSpec, tmp_path: Path) -> 
         assert np.abs(run[name].pos[-1] - run[NEAREST].pos[-1]).max() > 0
 
 
+@pytest.mark.slow
 def test_only_missing_and_outdated_runs_are_computed(sand: DatasetSpec, tmp_path: Path) -> None:
     runs = ControlRuns(tmp_path / "sand" / "tiny", sand, TrainedValues(sand), "test_unseen", 2)
     reported: list[tuple[int, int]] = []

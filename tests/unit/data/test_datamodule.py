@@ -85,6 +85,7 @@ def test_a_resumed_loader_continues_the_sequence(root: Path) -> None:
     assert sorted(places) == [(t, f) for t in (0, 1) for f in (2, 3, 4)]  # one pass
 
 
+@pytest.mark.slow
 def test_worker_processes_change_nothing(root: Path) -> None:
     for a, b in zip(first_batches(datamodule(root), 4), first_batches(datamodule(root, num_workers=2), 4), strict=True):
         assert torch.equal(a["sand"].x, b["sand"].x)
@@ -104,6 +105,7 @@ def test_validation_windows_are_fixed_and_free_of_noise(root: Path) -> None:
     assert [b.frame.tolist() for b in few.val_dataloader()] == [[2, 4]]
 
 
+@pytest.mark.slow
 def test_validation_batches_keep_the_budget_of_nodes_and_change_no_value(root: Path) -> None:
     plain = list(datamodule(root).val_dataloader())
     assert [b["sand"].num_nodes for b in plain] == [36]
@@ -190,6 +192,7 @@ def with_statistics(data: TrajectoryDataModule) -> LearnedSimulator:
     return simulator
 
 
+@pytest.mark.slow
 def test_a_rare_material_is_standardised_like_any_other(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Sand is in two of twelve trajectories, which the eight windows skip; snow is in a third, far from the fluid."""
     train = [scene(k, ("fluid", 1e-3)) for k in range(12)]
@@ -211,6 +214,7 @@ def test_a_rare_material_is_standardised_like_any_other(tmp_path: Path, caplog: 
     assert missing == ["not in the training windows that statistics are taken from: snow–radius–fluid; its features are not standardised"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_touching", [2, 12])
 def test_a_rare_contact_is_standardised_like_any_other(tmp_path: Path, caplog: pytest.LogCaptureFixture, num_touching: int) -> None:
     """Sand and fluid are in all trajectories, and touch in two that the eight windows skip; or in all, of which the eight windows tell enough."""
@@ -241,6 +245,7 @@ def test_validation_trajectories_come_from_the_validation_split(root: Path) -> N
     assert [t.metadata.split for t in datamodule(root).val_trajectories(3)] == ["val"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [None, "", "{"])
 def test_missing_statistics_are_a_readable_error(root: Path, content: str | None) -> None:
     path = root / "statistics.json"
@@ -320,6 +325,7 @@ def test_one_damaged_trajectory_is_never_too_many_unless_it_is_all(root: Path) -
         datamodule(with_another(root, moved(3, np.nan), 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_static", [0, 5])
 def test_what_is_fast_is_no_jump(root: Path, num_static: int, caplog: pytest.LogCaptureFixture) -> None:
     """A projectile among things at rest, farther in a frame than neighbours see."""

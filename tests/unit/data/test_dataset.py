@@ -43,6 +43,7 @@ def arrays_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
     return {f"{prefix}{k}": v for prefix, owner in owners.items() for k, v in vars(owner).items() if isinstance(v, np.ndarray)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cache_bytes", [0, 2**30])
 @pytest.mark.parametrize("noise", [Noise(0.1, 0.0), Noise(0.0, 0.5)])
 def test_an_epoch_with_noise_changes_nothing_that_is_stored(store: Path, noise: Noise, cache_bytes: int) -> None:
@@ -96,6 +97,7 @@ def test_windows_cover_every_frame_with_a_past_and_a_future(store: Path, history
         assert (data[k].trajectory, data[k].frame) == (number, frame)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("history", [1, 3])
 def test_without_noise_the_target_is_the_integrators_acceleration(store: Path, history: int) -> None:
     data = dataset(store, history, noise=None)
@@ -208,6 +210,7 @@ def test_batches_of_a_number_of_graphs_are_cut_from_the_order(store: Path) -> No
     assert list(itertools.islice(BatchSize(4).batches(data, seed=4, step=2), 4)) == [order[k : k + 4] for k in (8, 12, 16, 20)]
 
 
+@pytest.mark.slow
 def test_a_split_that_is_not_held_takes_the_memory_of_a_window(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> None:
     write_shard(tmp_path / "train" / "shard-00000.h5", [new_trajectory(0, num_frames=3000, num_nodes=60)])
     size = read_trajectory(tmp_path / "train" / "shard-00000.h5", "00000").pos.nbytes
@@ -323,6 +326,7 @@ def edited(store: Path, key: str) -> None:
             group[key][...] = group[key][...] + np.float32(0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["pos", "mass", "metadata"])
 @pytest.mark.parametrize("cache_bytes", [0, CACHE_BYTES])
 def test_what_was_changed_without_its_digest_is_not_learned_from(store: Path, key: str, cache_bytes: int) -> None:

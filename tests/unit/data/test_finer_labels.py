@@ -47,6 +47,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+@pytest.mark.slow
 def test_stored_tracers_begin_as_the_plain_scene(spec: DatasetSpec, folder: Path) -> None:
     plain = dataset("data=sand", *SMALL)
     assert (spec.name, plain.name) == ("sand_fine2", "sand")
@@ -61,6 +62,7 @@ def test_stored_tracers_begin_as_the_plain_scene(spec: DatasetSpec, folder: Path
         assert stored.metadata.spacing == plain.scene.spacing and stored.metadata.solver_dt < plain.solver.solver_dt
 
 
+@pytest.mark.slow
 def test_an_interrupted_data_set_resumes_with_the_same_bytes(spec: DatasetSpec, folder: Path, tmp_path: Path) -> None:
     again = generate(tmp_path, spec)
     (again / "train" / "shard-00001.h5").unlink()
@@ -125,6 +127,7 @@ def test_other_settings_are_refused_in_the_same_folder(spec: DatasetSpec, folder
         generate(folder.parents[1], other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", ["0", "1.5", "3", "-2", "two", "null"])
 def test_other_factors_are_refused(value: str) -> None:
     with pytest.raises(ConfigError, match=r"data\.fine.*1, 2 or 4"):

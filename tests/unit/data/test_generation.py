@@ -75,6 +75,7 @@ def contents(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(Path(folder).rglob("*")) if p.is_file()}
 
 
+@pytest.mark.slow
 def test_layout(folder):
     names = set(contents(folder))
     assert {
@@ -92,6 +93,7 @@ def test_layout(folder):
         assert all(t.num_frames == SPEC.num_frames and t.metadata.split == split for t in trajectories)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_resume_equals_uninterrupted(folder, tmp_path, num_workers):
     """Lose shards, damage one, leave a half-written file behind: the next run restores the same bytes."""
@@ -109,6 +111,7 @@ def test_resume_equals_uninterrupted(folder, tmp_path, num_workers):
     assert (again / "train" / "shard-00000.h5").stat().st_mtime_ns == kept
 
 
+@pytest.mark.slow
 def test_damage_in_place_is_found_and_repaired(folder, tmp_path, caplog):
     """A shard that opens but whose bytes have changed is generated again, with a line in the log; the others are left alone."""
     again = tmp_path / SPEC.name / SPEC.size
@@ -169,8 +172,8 @@ def test_killed_run_resumes(folder, tmp_path):
     assert seen[0][0] >= 4 and seen[-1] == (15, 15)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("data", ["sand", *(pytest.param(d, marks=pytest.mark.long) for d in ("snow", "elastomer", "fluid", "fem"))])
+@pytest.mark.long
+@pytest.mark.parametrize("data", ["sand", "snow", "elastomer", "fluid", "fem"])
 def test_killed_at_random_moments(tmp_path, data):
     """Four times SIGKILL (twenty over the five data sets) of the command with two workers, then to the end: every shard is sound and all bytes are those of
     an uninterrupted run.
@@ -250,6 +253,7 @@ def test_other_spec_is_refused_by_key(folder):
     assert "Delete the folder" in str(error.value)
 
 
+@pytest.mark.slow
 def test_data_of_another_version_of_the_solver_are_refused(tmp_path):
     """The error names the version, although settings differ, too. The time step is compared as well."""
     few = replace(SPEC, num_train=1, num_val=0, num_test=0, num_test_unseen=0, num_frames=3)
@@ -437,6 +441,7 @@ def test_failure_names_split_index_and_seed(tmp_path, num_workers):
     assert not list(tmp_path.rglob("*.h5")) and not list(tmp_path.rglob("*.part*"))
 
 
+@pytest.mark.slow
 def test_small_disk_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(GenerationError, match="GiB free"):
         generate(tmp_path, replace(SPEC, num_frames=10**6, num_train=10**4))
@@ -503,6 +508,7 @@ def test_invalid_spec_is_refused(change, message):
         replace(SPEC, **change)
 
 
+@pytest.mark.slow
 def test_parts_share_the_work_and_give_the_same_bytes(folder, tmp_path):
     first = generate(tmp_path, SPEC, part=(0, 2))
     assert 0 < len(list(first.rglob("*.h5"))) < 8 and not (first / "statistics.json").exists()
@@ -574,6 +580,7 @@ def test_a_description_whose_checksum_is_another_is_named(folder, tmp_path):
         generate(tmp_path, SPEC, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["num_train", "num_val", "num_test", "num_test_unseen", "num_frames"])
 def test_numbers_that_no_machine_can_list_are_refused(name):
     with pytest.raises(ConfigError, match=rf"data.{name}.*1000000"):

@@ -65,6 +65,7 @@ def windows(module: TrajectoryDataModule, views: list[StoredTrajectory]) -> Wind
     return WindowDataset(views, module.builder, own.noise, own.velocity_unit, own.seed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cache_bytes", [0, 2**30])
 def test_every_third_frame_is_the_same_as_a_data_set_that_stores_no_others(
     stored: dict[str, list[Trajectory]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cache_bytes: int
@@ -161,6 +162,7 @@ def test_the_radius_follows_the_fastest_node_up_to_a_limit(trajectory: Trajector
         connectivity_radius(around, 4, 7.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", ["0", "-2", "1.5", "true", "null", "many"])
 @pytest.mark.parametrize("data", ["sand", "imported"])
 def test_other_strides_than_counts_of_frames_are_refused(value: str, data: str) -> None:

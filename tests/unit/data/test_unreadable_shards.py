@@ -15,6 +15,7 @@ from gpe_pl.trajectory.store import ReadError
 from tests.unit.data.test_generation import SPEC, contents
 
 
+@pytest.mark.slow
 def test_shards_that_the_machine_cannot_read_now_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     again = generate(tmp_path, SPEC)
     before, opened = contents(again), h5py.File

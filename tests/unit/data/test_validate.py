@@ -61,6 +61,7 @@ def test_sound_store(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "violations" not in report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edit", "message"),
     [

@@ -47,6 +47,7 @@ def untrained(spec: DatasetSpec, folder: Path) -> list[str]:
     return [str(folder / f"{seed}.ckpt") for seed in range(2)]
 
 
+@pytest.mark.slow
 def test_disagreement_is_zero_only_for_equal_models(models: list[str]) -> None:
     apart = disagreement(LearnedEnsemble.from_checkpoints(models), pool(), [0, 4], FRAMES)
     assert apart.shape == (2,) and (apart > 0).all()
@@ -81,6 +82,7 @@ def test_a_draw_has_no_scene_twice_and_takes_zeros_last() -> None:
     np.testing.assert_array_equal(drawn(values, 3, (0, 1)), picks[:3])
 
 
+@pytest.mark.slow
 def test_a_choice_is_noted_and_made_once(tmp_path: Path, models: list[str]) -> None:
     folder, settings = tmp_path / "sand" / "tiny", ActiveSettings(models, horizon=0.015)
     chosen_scenes.write(folder, [chosen_scenes.Choice([0, 1], [], 0, 0, [], 0.0)])
@@ -98,6 +100,7 @@ def test_without_a_data_set_all_scenes_are_chosen(tmp_path: Path, models: list[s
     assert choice is not None and len(choice.scenes) == 3 and chosen_scenes.read(tmp_path / "sand" / "tiny") == [choice]
 
 
+@pytest.mark.slow
 def test_what_cannot_choose(tmp_path: Path, models: list[str]) -> None:
     def refused(match: str, settings: ActiveSettings, spec: DatasetSpec, number: int = 3) -> None:
         with pytest.raises(GpeError, match=match):
@@ -120,6 +123,7 @@ def test_scenes_with_openings_are_refused(models: list[str], tmp_path: Path) -> 
         disagreement(LearnedEnsemble.from_checkpoints(untrained(spec, tmp_path)), spec, [0], FRAMES)
 
 
+@pytest.mark.slow
 def test_the_command_chooses_and_simulates(tmp_path: Path, models: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     def run(*overrides: str) -> str:
         simulate(compose("simulate", *DATA, "data.num_test_unseen=0", "num_workers=1", f"paths.data={tmp_path}", *overrides))

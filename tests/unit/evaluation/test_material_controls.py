@@ -52,6 +52,7 @@ def errors(rows: list[Row], model: str, split: str = UNSEEN) -> list[float]:
     return [r.value for r in rows if (r.model, r.split, r.metric, r.horizon) == (model, split, "rollout_mse", "full")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("embedding", ["affine", "none"])
 def test_controls_change_what_reads_the_parameter(embedding: str, controls: MaterialControls, tmp_path: Path) -> None:
     learned = simulator(controls.root, embedding)
@@ -85,6 +86,7 @@ def test_pictured_scenes_are_at_three_values_in_ascending_order(controls: Materi
     assert not np.array_equal(scenes[0][2].pos[-1], prediction.pos[-1]) and not np.array_equal(scenes[2][2].pos[-1], prediction.pos[-1])
 
 
+@pytest.mark.slow
 def test_controls_give_a_picture_of_three_values(controls: MaterialControls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for other in ("write_pictures", "write_error_curve"):
         monkeypatch.setattr(split_files, other, lambda *_: None)

@@ -54,6 +54,7 @@ def test_a_particle_inside_a_wall_counts(inside: Trajectory) -> None:
     assert _fraction_outside(replace(inside, pos=pos), 1, 10, 0.0) == pytest.approx(1 / (10 * inside.num_nodes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("num_trajectories", "numbers"), [(None, {1, 2}), (2, {1})])
 def test_scenes_keep_their_numbers_if_others_are_too_short(
     new_trajectory: Callable[..., Trajectory], tmp_path: Path, num_trajectories: int | None, numbers: set[int]

@@ -44,6 +44,7 @@ def values(records: list[Measurement]) -> dict[str, float]:
     return {r.metric: r.value for r in records}
 
 
+@pytest.mark.slow
 def test_a_rollout_from_rest_is_counted_and_drawn(tmp_path: Path) -> None:
     seen: list[tuple[int, int]] = []
     records = run(simulator(), CANYON, SETTINGS, tmp_path, lambda done, total: seen.append((done, total)))
@@ -61,6 +62,7 @@ def test_a_rollout_from_rest_is_counted_and_drawn(tmp_path: Path) -> None:
     assert [*tmp_path.glob("showcase.gif"), *tmp_path.glob("showcase.mp4")]
 
 
+@pytest.mark.slow
 def test_without_containment_what_enters_a_wall_is_counted(tmp_path: Path) -> None:
     heavy = simulator(2000.0)  # some fly into the ground at once
     found = values(run(heavy, CANYON, SETTINGS, tmp_path))
@@ -68,6 +70,7 @@ def test_without_containment_what_enters_a_wall_is_counted(tmp_path: Path) -> No
     assert found["fraction_outside_at_end"] == 0
 
 
+@pytest.mark.slow
 def test_a_rollout_that_explodes_says_so(tmp_path: Path) -> None:
     records = run(simulator(float("inf")), CANYON, SETTINGS, tmp_path)
     assert values(records)["num_steps"] == 0
@@ -112,6 +115,7 @@ def test_a_material_that_cannot_be_is_refused_before_anything_runs(values: dict[
         start(simulator(), CANYON, ShowcaseSettings(values=values))
 
 
+@pytest.mark.slow
 def test_what_approximate_levels_leave_out_is_counted(tmp_path: Path) -> None:
     simulated = simulator()
     simulated.skips = Skips(sleep_after=1, rest_step_spacings=1e3, rest_step_change_spacings=1e3)

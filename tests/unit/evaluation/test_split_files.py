@@ -30,6 +30,7 @@ def written(folder: Path, settings: EvaluationSettings, scenes: list[PredictedSc
     return sorted(path.name for path in folder.iterdir())
 
 
+@pytest.mark.slow
 def test_quantities_are_written_and_drawn(
     tmp_path: Path, new_trajectory: Callable[..., Trajectory], monkeypatch: pytest.MonkeyPatch
 ) -> None:

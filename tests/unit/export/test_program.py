@@ -87,6 +87,7 @@ def test_a_program_has_the_scale_of_the_copy_that_is_exported() -> None:
     assert_same_step(ExportedStep(learned), learned, scenes.state(materials=("sand",), history=3).to_torch())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["triangles", "lattice", "tetrahedra"])
 @pytest.mark.parametrize("model", [GPE, GNS, DPINet])
 def test_meshes(model: Any, kind: Any) -> None:
@@ -267,9 +268,8 @@ def test_a_program_of_a_periodic_domain(tmp_path: Path) -> None:
     [
         *((m, "particles") for m in SMALL),
         (GPE, "no parameter"),
-        (GPE, "mesh"),
         (GPE, "bodies"),
-        *(pytest.param(m, "mesh", marks=pytest.mark.long) for m in (GNS, DPINet)),
+        *(pytest.param(m, "mesh", marks=pytest.mark.long) for m in (GPE, GNS, DPINet)),
     ],
 )
 def test_every_model_becomes_a_program(model: Any, kind: str, tmp_path: Path) -> None:

@@ -111,6 +111,7 @@ def meshed(name: str) -> Trajectory:
     return Trajectory.from_numpy(rest + swing, 0.01, "elastomer", {"elastomer": 1e5}, cells=cells)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESHES)
 def test_cells_keep_their_kind(tmp_path: Path, name: str) -> None:
     """Through the store and a rollout to a program that draws them."""

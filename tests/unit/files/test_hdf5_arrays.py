@@ -106,6 +106,7 @@ def pipe(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("pipe")
 @pytest.mark.parametrize(("make", "message"), REFUSED)
 @pytest.mark.parametrize("key", ["pos", "mass"])

@@ -76,6 +76,7 @@ def test_parts_of_paths_become_portable_and_stay_different(one: str, other: str)
     assert (portable(one) == portable(other)) == (one == other)
 
 
+@pytest.mark.slow
 def test_commands_refuse_names_before_they_make_folders(tmp_path: Path) -> None:
     paths = [f"paths.data={tmp_path}/data", f"paths.runs={tmp_path}/runs"]
     with pytest.raises(NameRefused, match=r"^reuse='\.\./x': must not"):

@@ -57,6 +57,7 @@ def test_metrics(tmp_path: Path, place: Callable[[Path], None], name: str) -> No
         list(read_rows(tmp_path / "metrics.csv"))
 
 
+@pytest.mark.slow
 @PLACED
 def test_archives_of_a_source(tmp_path: Path, place: Callable[[Path], None]) -> None:
     raw_arrays(tmp_path / "raw")

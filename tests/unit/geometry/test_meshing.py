@@ -81,6 +81,7 @@ def test_plane_meshes(family, mesher, num_cells):
     assert lengths.min() > 0.4 * spacing and np.mean(lengths) == pytest.approx(spacing, rel=0.08)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", SOLIDS)
 @pytest.mark.parametrize("num_cells", [400, pytest.param(1000, marks=pytest.mark.slow)])
 def test_tetrahedra(family, num_cells):
@@ -99,6 +100,7 @@ def test_tetrahedra(family, num_cells):
     assert np.mean(lengths) == pytest.approx(spacing, rel=0.12)
 
 
+@pytest.mark.slow
 def test_same_seed_gives_same_bytes():
     def meshes():
         rng = np.random.default_rng(3)

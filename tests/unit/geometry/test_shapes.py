@@ -280,6 +280,7 @@ def test_grid_keeps_the_distances_at_its_nodes(solid: Any) -> None:
     assert not grid.values.flags.writeable
 
 
+@pytest.mark.slow
 @each_gridded
 def test_grid_converges_to_the_solid(solid: Any) -> None:
     points = random_points(dimension(solid))
@@ -327,6 +328,7 @@ def test_grid_numpy_equals_torch(solid: Any, dtype: str) -> None:
     assert grid.signed_distance(points[3]).shape == ()
 
 
+@pytest.mark.slow
 @each_gridded
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 2.5])
 def test_grid_samples_cover_the_surface(solid: Any, ratio: float) -> None:

@@ -53,6 +53,7 @@ def assert_distances(values: np.ndarray, exact: np.ndarray) -> None:
     np.testing.assert_allclose(values[np.abs(exact) < 0.1], exact[np.abs(exact) < 0.1], atol=1.2e-3)
 
 
+@pytest.mark.slow
 def test_distances_equal_brute_force() -> None:
     rng = np.random.default_rng(0)
     corners = rng.uniform(-0.3, 1.3, (12, 3, 3))  # some of them cross the rim of the grid or lie outside
@@ -79,6 +80,7 @@ def test_point_to_triangle_in_every_region() -> None:
 # --- meshes -------------------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extension", ["obj", "stl", "ply"])
 def test_ball_from_every_mesh_format(tmp_path: Path, extension: str, caplog: pytest.LogCaptureFixture) -> None:
     trimesh = pytest.importorskip("trimesh")
@@ -267,6 +269,7 @@ def write_heights(path: Path, rows: np.ndarray) -> None:
         Image.fromarray(np.round((rows - rows.min()) / np.ptp(rows) * 255).astype(np.uint8)).save(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["map.npy", "map.npz", "map.csv", "map.png", "deep.png"])
 def test_height_maps_fill_the_domain(tmp_path: Path, name: str) -> None:
     """Rows run from north to south; the lowest place lies on the floor and ``relief`` is the whole height."""
@@ -403,6 +406,7 @@ def ground(grid: DistanceGrid) -> np.ndarray:
     return np.asarray(grid.origin[2] + grid.spacing * np.argmax(grid.values > 0, axis=-1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_canyon_leads_from_the_reservoir_over_the_fall_into_the_pool(seed: int) -> None:
     made = canyon(seed, CANYON, 1 / 24)
@@ -433,6 +437,7 @@ def test_canyon_is_reproducible_and_differs_by_seed() -> None:
     assert fine.fall == made.fall
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "start", "repeated", "count", "message"),
     [

@@ -69,6 +69,7 @@ def covered(own: Bands, scenes: list[PredictedScene]) -> list[Row]:
     return [row for number, each in enumerate(scenes) for row in coverage.add(each, {2: "0.02s"}, ("test", number, "seen", 0.0))]
 
 
+@pytest.mark.slow
 def test_new_scenes_are_covered_as_promised(checkpoint: Path) -> None:
     """Over many calibrations, so that chance does not decide."""
     values: dict[str, list[float]] = {}
@@ -157,6 +158,7 @@ def test_older_bands_are_of_rollouts_with_the_settings_of_the_model(checkpoint: 
     assert TypeAdapter(Bands).validate_json(json.dumps(values)).settings == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["absent", "held"])
 def test_only_nodes_that_errors_are_about_are_covered(checkpoint: Path, kind: str) -> None:
     """Three quarters of the nodes have no error: they are not in the scene, or their motion is given. The others are covered as promised."""

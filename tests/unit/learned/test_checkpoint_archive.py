@@ -92,6 +92,7 @@ def tuples(path: Path) -> None:
     rewritten(path, {"data.pkl": b"\x80\x02}(" + body + b"u."})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -131,6 +132,7 @@ def shared(levels: int) -> Any:
     return value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("values", "message"),
     [

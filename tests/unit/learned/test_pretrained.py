@@ -32,6 +32,7 @@ def test_a_model_is_called_as_its_run(tmp_path: Path) -> None:
     assert model_name(tmp_path / "c:d.ckpt", tmp_path) == "c~3Ad" and model_name(tmp_path / "a" / "c=*", tmp_path) == "a_c=~2A"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", names())
 def test_a_shipped_model_is_small_described_and_loads(name: str) -> None:
     path = checkpoint_path(name)

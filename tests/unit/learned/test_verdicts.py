@@ -62,6 +62,7 @@ def test_a_card_begins_with_the_latest_failures(checkpoint: Path, tmp_path: Path
         judged(results)
 
 
+@pytest.mark.slow
 def test_a_card_says_that_its_model_has_static_friction(tmp_path: Path) -> None:
     rested = runpy.run_path(str(Path(__file__).parents[3] / "docs" / "ship_model.py"))["rested"]
     rested.__globals__["FOLDER"] = tmp_path

@@ -59,6 +59,7 @@ def published(model: Any, data: HeteroData) -> Tensor:
     return f
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("materials", [("sand",), ("sand", "snow")])
 def test_equals_the_published_layers(materials: tuple[str, ...], dim: int) -> None:

@@ -66,6 +66,7 @@ def algorithm_1(model: Any, data: HeteroData) -> dict[str, Tensor]:
     return {m: torch.stack([model.node_decoder[m](h[m, k]) for k in range(c)]) for m, c in count.items() if c}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("implementation", ["factored", "plain"])
 @pytest.mark.parametrize("interaction", ["directed", "negated"])
 @pytest.mark.parametrize("materials", [("sand",), ("sand", "snow")])
@@ -83,6 +84,7 @@ def test_equals_algorithm_1(interaction: str, implementation: str, materials: tu
         torch.testing.assert_close(out[material], value, rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interaction", ["directed", "negated"])
 @pytest.mark.parametrize("level_weights", ["shared", "separate"])
 def test_equals_algorithm_1_on_meshes(interaction: str, level_weights: str) -> None:
@@ -122,6 +124,7 @@ def test_stress_is_decoded_at_the_nodes_of_materials_that_have_one(dim: int) -> 
         GPE(scenes.builder().spec, num_message_passing_steps=1, hidden_channels=8, stress=True)
 
 
+@pytest.mark.slow
 def test_plain_and_factored_are_the_same_function_with_the_same_gradient() -> None:
     data = scenes.graph(("sand", "snow"))
     spec = scenes.builder(("sand", "snow")).spec

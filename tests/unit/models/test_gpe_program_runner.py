@@ -93,6 +93,7 @@ def test_meshes_with_virtual_nodes(variant: dict[str, Any]) -> None:
     assert_equal(build(meshes.spec(3), **variant), meshes.graph(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["triangles", "tetrahedra"])
 @pytest.mark.parametrize("interaction", INTERACTIONS)
 def test_contacts_of_bodies(interaction: str, kind: str) -> None:
@@ -115,6 +116,7 @@ def scattered(num_alone: int = 7, materials: tuple[str, ...] = ("sand", "snow", 
     return scenes.to_dtype(scenes.builder(materials)(replace(state, pos=pos, material_params=padded).to_torch()), torch.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "skips", [Skips(), Skips(isolated_nodes=False), Skips(absent_types=False), Skips(sorted_from=1), Skips(edges_at_once=5)], ids=str
 )
@@ -140,6 +142,7 @@ def test_batches() -> None:
     assert_equal(build(scenes.builder(("sand", "snow")).spec, island_momentum="angular"), batched(graphs))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", TOLERANCE)
 @pytest.mark.parametrize("num_nodes", [0, 1, 2, 255, 257, 5000])
 def test_sizes(num_nodes: int, dtype: torch.dtype) -> None:
@@ -149,6 +152,7 @@ def test_sizes(num_nodes: int, dtype: torch.dtype) -> None:
         assert_equal(build(scenes.builder().spec, dtype, num_message_passing_steps=2, **settings), data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", TOLERANCE)
 @pytest.mark.parametrize("threads", [1, 2])
 def test_graphs_that_grow_and_shrink(threads: int, dtype: torch.dtype) -> None:
@@ -180,6 +184,7 @@ class DoubleBuilder(GraphBuilder):
     precision = torch.float64
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [pytest.param(torch.float32, marks=pytest.mark.slow), torch.float64])
 def test_rollouts_of_100_steps(dtype: torch.dtype) -> None:
     """Edges change in every step. Graphs are in single precision unless the builder says otherwise."""

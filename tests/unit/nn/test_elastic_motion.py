@@ -138,6 +138,7 @@ def motion(v: dict[str, Any]) -> tuple[Tensor, Tensor]:
     return elastic_motion(v["pos"], v["vel"], v["forcing"], v["mass"], law, v["cells"], walls, touching=touching)[:2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_compiled_motion_and_its_gradients_equal_the_plain_ones(kind: str) -> None:
     _, together = several(kind)
@@ -247,6 +248,7 @@ def test_a_mirror_image_moves_as_the_mirror_image(kind: str) -> None:
         torch.testing.assert_close(mirror * b, a, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [k if k in ("triangles", "tetrahedra") else pytest.param(k, marks=pytest.mark.slow) for k in KINDS])
 def test_energy_is_kept_without_viscosity_and_dissipated_with_it(kind: str) -> None:
     """Substeps change from frame to frame, so leapfrog's energy changes by up to 10 % in 200 frames."""
@@ -316,6 +318,7 @@ def test_a_node_behind_its_plane_is_not_pushed_out_at_once() -> None:
     torch.testing.assert_close(pos, body.rest, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [20.0, 40.0])
 @pytest.mark.parametrize("coefficient", [0.5, 0.7])
 def test_friction_holds_or_lets_slip_as_coulomb_says(coefficient: float, angle: float) -> None:
@@ -369,6 +372,7 @@ def test_only_cells_that_need_too_many_substeps_are_softened() -> None:
     assert int(number) == MAX_SUBSTEPS and float(excess[0]) > 2.0 and bool((excess[1:] == 1.0).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_any_constants_keep_a_body_finite(kind: str) -> None:
     rng = np.random.default_rng(0)
@@ -476,6 +480,7 @@ def test_an_unstable_scene_changes_no_other_of_its_batch(plain: bool, monkeypatc
         assert bool(other.isfinite().all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "scale"), CRUSHING)
 def test_gradients_of_an_unstable_scene_are_those_of_the_last_try(kind: str, scale: float) -> None:
     body, vel = crushed(kind, scale)

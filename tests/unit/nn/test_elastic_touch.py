@@ -75,6 +75,7 @@ def test_nodes_bounce_off_each_other_and_keep_their_momentum(pair: Touching, rat
     assert after == pytest.approx(1.0, abs=0.05) if ratio == 1.0 else 0.2 < after < ratio
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("distance", "speed"), [(0.9, 0.01), (1.3, 0.6), (1.4, 0.6), (1.9, 1.0), (0.5, 0.0)])
 @pytest.mark.parametrize("adhesion", [0.0, 0.9])
 def test_a_contact_that_is_far_too_stiff_for_the_substeps_stays_bounded(distance: float, speed: float, adhesion: float) -> None:

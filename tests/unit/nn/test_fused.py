@@ -59,6 +59,7 @@ PASSES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PASSES)
 def test_gradients_summed_over_many_rows_keep_single_precision(name: str) -> None:
     function, values = PASSES[name](200_000)
@@ -74,6 +75,7 @@ def test_gradients_summed_over_many_rows_keep_single_precision(name: str) -> Non
             assert (single.double() - expected).norm() / expected.norm() < (1e-5 if is_product else 1e-6), value.shape
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PASSES)
 def test_second_derivatives_are_those_of_finite_differences(name: str) -> None:
     function, values = PASSES[name](9)

@@ -154,6 +154,7 @@ def test_on_other_scenes_the_papers_ratios_are_left_out(sweep: Path) -> None:
     assert cells(text, "sand")["GPE / best baseline"] == "0.50 [0.25, 2.00]"
 
 
+@pytest.mark.slow
 def test_figures_are_drawn(sweep: Path) -> None:
     report_domains(sweep, finished_runs(sweep))
     assert all((sweep / name).stat().st_size > 1000 for name in ("table1.png", "error_by_parameter.png"))

@@ -88,6 +88,7 @@ def test_evaluations_that_start_at_different_times_are_marked(tmp_path: Path) ->
     assert cells(text, "sand", UNSEEN, "static_friction=0.5")[5] == "1 [1, 1]"  # labels need no history
 
 
+@pytest.mark.slow
 def test_each_domain_says_whether_it_reads_the_material(tmp_path: Path) -> None:
     write_evaluation(tmp_path / "runs" / "sand", "sand", 0.5, nearest=1.0)
     write_evaluation(tmp_path / "runs" / "fluid", "fluid", 1.0, nearest=1.0)

@@ -89,6 +89,7 @@ def test_few_scenes_give_no_verdict(sweep: Path) -> None:
     assert "| too few scenes |" in "\n".join(material_lines({("sand", "GPE"): [few]}))
 
 
+@pytest.mark.slow
 def test_the_table_of_a_sweep_has_every_control(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sweep_table.report_sweep(sweep, finished_runs(sweep))
     text = (sweep / "table.md").read_text()
@@ -104,6 +105,7 @@ def test_the_table_of_a_sweep_has_every_control(sweep: Path, capsys: pytest.Capt
     assert "yes" in rows["affine"] and "reads the material: yes" in sweep_table.conclusion(sweep / "affine" / "0")
 
 
+@pytest.mark.slow
 def test_tables_of_domains_have_the_controls_of_every_model(tmp_path: Path) -> None:
     write_run(tmp_path / "gpe", "affine", 0, READS)
     write_run(tmp_path / "gns", "feature", 0, READS | {"own": 1.3}, model="gpe_pl.models.gns.GNS")
@@ -116,6 +118,7 @@ def test_tables_of_domains_have_the_controls_of_every_model(tmp_path: Path) -> N
     assert (tmp_path / "reads_material.png").exists()
 
 
+@pytest.mark.slow
 def test_runs_without_controls_have_no_table(tmp_path: Path) -> None:
     write_run(tmp_path / "run", "affine", 0, {"own": 1.0})
     runs = finished_runs(tmp_path)

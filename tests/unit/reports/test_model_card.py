@@ -44,6 +44,7 @@ def test_a_card_says_how_bodies_bend(ship_model: ModuleType) -> None:
     assert "Medians" not in ship_model.card("fem", "python -m gpe_pl.fit", "abc", simulator, errors, settings)
 
 
+@pytest.mark.slow
 def test_the_last_checkpoint_is_shipped_with_its_own_evaluations(
     ship_model: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -52,6 +52,7 @@ def cells(folder: Path, interaction: str) -> list[list[str]]:
     return [[" ".join(word for word in cell.split() if word[0] != "[" and word[-1] != "]") for cell in row] for row in rows]
 
 
+@pytest.mark.slow
 def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path) -> None:
     sweep_table.report_sweep(runs, finished_runs(runs))
     training, rollout, *_ = cells(runs, "negated")
@@ -66,6 +67,7 @@ def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path)
     assert cells(runs, "ballistic")[0][2] == "4"
 
 
+@pytest.mark.slow
 def test_forward_times_are_shown_where_all_variants_have_them(runs: Path) -> None:
     networks = {run.folder.relative_to(runs).as_posix(): sweep_table.network_digest(run) for run in finished_runs(runs)}
     names = [f"{name}/0" for name in ("directed", "negated", "odd", "odd_even")]
@@ -82,12 +84,14 @@ def test_forward_times_are_shown_where_all_variants_have_them(runs: Path) -> Non
         assert cells(runs, "negated")[0][3] == "–"
 
 
+@pytest.mark.slow
 def test_failed_rollouts_are_counted(runs: Path) -> None:
     sweep_table.report_sweep(runs, finished_runs(runs))
     _, rollout, *_ = cells(runs, "directed")
     assert rollout[2] == "3.5 **1.1×**, 1 of 2 failed"  # ballistic flight's 2 in the scene that failed, and 5
 
 
+@pytest.mark.slow
 def test_the_csv_has_unseen_values_also_apart(runs: Path) -> None:
     sweep_table.report_sweep(runs, finished_runs(runs))
     with open(runs / "table.csv", newline="") as handle:
@@ -96,6 +100,7 @@ def test_the_csv_has_unseen_values_also_apart(runs: Path) -> None:
     assert values == pytest.approx({"test_unseen": 2e-3, "test_unseen/interpolated": 1e-3, "test_unseen/extrapolated": 3e-3})
 
 
+@pytest.mark.slow
 def test_a_repeated_run_counts_once(runs: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_run(runs / "again", "odd", 0)
     sweep_table.report_sweep(runs, finished_runs(runs))
@@ -124,6 +129,7 @@ def test_a_configuration_of_other_types_is_named(runs: Path, change: dict[str, A
         sweep_table.report_sweep(runs, finished_runs(runs))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "content", [b"step,val/one_step_nmse\n9,x\n", b"step,val/one_step_nmse\nlast,0.5\n", b"val/one_step_nmse\n0.5\n", b"\xff\n"]
 )
@@ -143,11 +149,13 @@ def test_names_of_files_that_are_shown_are_printable(runs: Path) -> None:
     assert "look at" in sweep_table.conclusion(folder) and "\x1b" not in sweep_table.conclusion(folder)
 
 
+@pytest.mark.slow
 def test_a_parameter_that_training_did_not_have_makes_a_figure(runs: Path) -> None:
     sweep_table.report_sweep(runs, finished_runs(runs))
     assert (runs / "error_by_parameter.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_stress_is_reported_beside_displacement_and_velocity(runs: Path) -> None:
     path = runs / "negated" / "0" / "metrics.csv"
     values = {"displacement_error": 0.25, "velocity_error": 0.5, "von_mises_error": 0.75, "stress_error": 1.25}
@@ -159,6 +167,7 @@ def test_stress_is_reported_beside_displacement_and_velocity(runs: Path) -> None
     assert not [row for row in cells(runs, "odd") if len(row) == 4]
 
 
+@pytest.mark.slow
 def test_scenes_without_one_parameter_make_no_figure(runs: Path) -> None:
     for path in runs.glob("*/*/metrics.csv"):
         write_rows(path, [replace(row, parameter=float("nan")) for row in read_rows(path)])
@@ -166,6 +175,7 @@ def test_scenes_without_one_parameter_make_no_figure(runs: Path) -> None:
     assert (runs / "table.md").exists() and not (runs / "error_by_parameter.png").exists()
 
 
+@pytest.mark.slow
 def test_bodies_have_a_table_of_what_was_measured(runs: Path) -> None:
     """The second scene has no bounce to compare with, and one rollout has failed."""
     path = runs / "negated" / "0" / "metrics.csv"
@@ -187,6 +197,7 @@ def test_bodies_have_a_table_of_what_was_measured(runs: Path) -> None:
     assert [row[2:] for row in cells(runs, "odd") if len(row) == 5 and row[1] == "test_unseen"] == [["–", "–", "–"]]
 
 
+@pytest.mark.slow
 def test_many_variants_have_tables_and_no_figure(tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     for k in range(29):
         monkeypatch.setitem(ERRORS, (f"kind{k}", 0), [1e-3, 2e-3])
@@ -197,6 +208,7 @@ def test_many_variants_have_tables_and_no_figure(tmp_path: Path, caplog: pytest.
     assert not list(tmp_path.glob("*.png"))
 
 
+@pytest.mark.slow
 def test_splits_and_horizons_of_later_variants_are_shown(tmp_path: Path) -> None:
     for interaction in ("negated", "odd"):
         write_run(tmp_path / interaction, interaction, 0)
@@ -210,6 +222,7 @@ def test_splits_and_horizons_of_later_variants_are_shown(tmp_path: Path) -> None
     assert not any(line.startswith("| negated | test |") and "[" in line for line in text.splitlines())
 
 
+@pytest.mark.slow
 def test_baselines_of_other_scenes_have_rows_of_their_own(tmp_path: Path) -> None:
     for interaction in ("negated", "odd"):
         write_run(tmp_path / interaction, interaction, 0)

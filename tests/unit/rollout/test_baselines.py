@@ -57,6 +57,7 @@ def test_ballistic_is_free_fall_where_nothing_is_in_the_way(backend: str, at_res
         np.testing.assert_allclose(result.pos[k], start.pos + k * DT * start.vel + DT**2 * fall * k * (k + 1) / 2, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
 @pytest.mark.parametrize("shapes", [WALLS, WALLS + OBSTACLES], ids=["walls", "obstacles"])
 def test_ballistic_never_enters_a_wall_and_sticks_where_it_touches(shapes: tuple[Shape, ...], backend: str) -> None:
@@ -91,6 +92,7 @@ def test_a_node_at_rest_on_a_wall_stays_there() -> None:
     np.testing.assert_array_equal(result.pos[-1], start.pos)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
 def test_constant_velocity_stops_at_walls(backend: str) -> None:
     shapes = WALLS + OBSTACLES

@@ -82,6 +82,7 @@ def energies_and_states(state: State, num_steps: int) -> tuple[np.ndarray, list[
     return kinetic - np.array([(s.pos @ s.gravity).mean() for s in states]), states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spin", [2.0, 10.0, 30.0])
 @pytest.mark.parametrize("size", [1.0, 0.42])
 def test_a_spinning_rod_that_strikes_walls_gains_no_energy(spin: float, size: float) -> None:
@@ -94,6 +95,7 @@ def test_a_spinning_rod_that_strikes_walls_gains_no_energy(spin: float, size: fl
     np.testing.assert_allclose(pdist(states[-1].pos), pdist(ROD), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("degrees", "rest"), [(10.0, 0.0), (44.0, 0.0), (46.0, 90.0)])
 def test_a_square_that_lands_on_a_corner_tips_over_to_the_next_side(degrees: float, rest: float) -> None:
     start = moving(turned(SQUARE, np.radians(degrees)), (0.5, 0.4), gravity=9.81)

@@ -18,6 +18,7 @@ from gpe_pl.scenes.rollouts import middle_values
 from gpe_pl.system.command_line import ArgumentFault
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", names())
 def test_scene_and_solver_of_a_shipped_model_are_recorded(model: str) -> None:
     simulator = LearnedSimulator.from_checkpoint(model)

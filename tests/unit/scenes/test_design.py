@@ -77,6 +77,7 @@ def test_a_rollout_that_stopped_has_no_distance() -> None:
     assert "keeps" not in text
 
 
+@pytest.mark.slow
 def test_an_obstacle_without_effect_stays_where_it_is() -> None:
     far = Scene(box=(1.0, 1.0)).block("sand", at=(0.1, 0.0), size=(0.08, 0.08))
     far = far.obstacle(Polygon(((0.60, 0.5), (0.64, 0.5), (0.64, 0.7), (0.60, 0.7)), 0.3))

@@ -156,6 +156,7 @@ FAULTS: list[tuple[Callable[[], Any], str]] = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "message"), FAULTS, ids=[message for _, message in FAULTS])
 def test_what_is_wrong_with_a_scene_is_named(make: Callable[[], Any], message: str) -> None:
     with pytest.raises(SceneFault) as caught:
@@ -221,6 +222,7 @@ def test_a_title_is_text(tmp_path: Path, title: str) -> None:
     assert isinstance(read_scene(tmp_path / "scene.yaml").title, str)
 
 
+@pytest.mark.slow
 def test_predict_writes_a_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("gpe_pl.viz.browser.has_desktop", lambda: False)
@@ -241,6 +243,7 @@ def test_predict_draws_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert ((red[..., 0] > 180) & (red[..., 1] < 90) & (red[..., 2] < 90)).sum() > 500
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("material", ["sand", "elastomer"])
 @pytest.mark.parametrize("size", [(0.2, 0.5), (0.1, 0.1), (0.07, 0.3), (0.0297, 0.3)])
 def test_bodies_have_their_size_and_mass(material: str, size: tuple[float, float]) -> None:

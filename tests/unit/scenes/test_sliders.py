@@ -25,6 +25,7 @@ def shown(value: str) -> str:
     return html.unescape(match[1])
 
 
+@pytest.mark.slow
 def test_a_slider_predicts_again_with_its_value(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ipywidgets", reason="ipywidgets is not installed")
     predicted: list[float] = []

@@ -46,6 +46,7 @@ def prepared(shapes, dim):
     return collider(shapes, tuple(origin), 1 / CELLS, counts), counts, origin, float(CELLS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHAPES)
 def test_push_out_agrees_with_geometry(name):
     """A point inside lands on the surface, along the shortest way, and keeps no velocity into the shape; a point outside is untouched."""
@@ -98,6 +99,7 @@ def test_walls_lie_on_grid_nodes():
     assert np.all(walls.conditions[row[3, 3], :, 2] >= 0)  # both walls act on the corner node
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHAPES)
 def test_nothing_passes_an_obstacle(name):
     """A block shot at an obstacle at 5 m/s never enters it: not at all, or by no more than its samples allow."""

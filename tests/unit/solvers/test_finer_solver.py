@@ -37,6 +37,7 @@ def started(name: str, fine: int) -> tuple[State, Divided]:
     return state, solver.solution(state)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("fine", [2, 4])
 def test_the_finer_solution_begins_as_the_scene(name: str, fine: int) -> None:

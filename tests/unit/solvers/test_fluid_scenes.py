@@ -59,6 +59,7 @@ def test_state_is_complete(scene: FluidScene, seed: int) -> None:
     assert np.all(state.boundary.friction == STICKY)
 
 
+@pytest.mark.slow
 @each_scene
 @pytest.mark.parametrize("seed", range(3))
 def test_particles_are_free_and_evenly_spread(scene: FluidScene, seed: int) -> None:
@@ -84,6 +85,7 @@ def test_boundary_nodes_lie_on_their_shapes(scene: FluidScene) -> None:
         assert shape_from_dict(shape_to_dict(shape)) == shape
 
 
+@pytest.mark.slow
 @each_scene
 def test_scenes_are_reproducible_and_differ(scene: FluidScene) -> None:
     first, again, other = sampled(scene, 0.05, 1), scene.sample({"fluid": 0.05}, 1), sampled(scene, 0.05, 2)
@@ -227,6 +229,7 @@ def test_canyon_water_starts_above_the_fall_in_the_reservoir() -> None:
         assert np.all(rock.signed_distance(lowest - (0.0, 0.0, 1 / 6)) < 0)
 
 
+@pytest.mark.slow
 def test_canyon_from_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     x = np.linspace(0, 1, 30)
     heights = np.broadcast_to(1 - x, (20, 30)) + 0.8 * np.abs(np.linspace(-1, 1, 20))[:, None]

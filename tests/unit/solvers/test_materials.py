@@ -85,6 +85,7 @@ def special_deformations(dim):
         yield turn @ np.diag(stretches[:dim]) @ turn.T @ turn
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", DIMS)
 @pytest.mark.parametrize("seed", range(3))
 def test_sand_equals_reference(dim, seed):
@@ -261,6 +262,7 @@ def test_unknown_code_gives_nan(dim):
     assert np.all(np.isnan(by_code(99, np.eye(dim), 0.0, constants)[2]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["random", "near identity", "double", "needle", "flat", "diagonal", "isotropic", "tiny", "huge"])
 def test_spectral_decomposition(kind):
     """Axes are orthonormal and rebuild the tensor to rounding, whatever the multiplicity of the principal values."""
@@ -312,6 +314,7 @@ def cohesive_reference(deformation, plastic, friction_angle, cohesion):
     return u @ np.diag(np.exp(strain)) @ vt, 0.0, u @ np.diag(stress) @ u.T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", DIMS)
 @pytest.mark.parametrize("values", COHESIVE)
 def test_sand_with_cohesion_equals_reference(dim, values):

@@ -67,6 +67,7 @@ def filled(state, value):
     return np.full((state.num_nodes, state.dim, state.dim), value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("material", ALL)
 @pytest.mark.parametrize(
@@ -105,6 +106,7 @@ def test_absurd_internal_state_or_boundary(dim, material, reason, change):
         assert np.all(np.isfinite(after.pos)) and np.all(np.abs(after.pos - 0.5) <= 0.5 + 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("speed", [10.0, 100.0])
 @pytest.mark.parametrize(
@@ -279,6 +281,7 @@ def with_obstacle(obstacle, dim):
     return replace(scene(dim, "sand"), boundary=closed(dim, obstacle))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["flat box", "narrow box", "sphere", "turned slab", "triangle", "thin arm", "plate", "ball"])
 def test_obstacle_thinner_than_a_cell_is_refused(name):
     """The error names the shape and the smallest thickness that the grid resolves."""
@@ -297,6 +300,7 @@ def test_obstacle_between_grid_nodes_is_refused():
     SOLVER[2].step(with_obstacle(thin("flat box", CELL), 2))  # exactly one cell is enough for a box
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("offset", [0.0, 0.25, 0.5, 0.75])
 def test_thinnest_allowed_slab_holds_at_10_m_per_s(dim, offset):
@@ -310,6 +314,7 @@ def test_thinnest_allowed_slab_holds_at_10_m_per_s(dim, offset):
     assert slab.high[-1] - 1e-9 <= lowest < slab.high[-1] + CELL / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_fall_from_rest_never_jumps_over_an_obstacle(dim):
     """Under any gravity that the solver accepts, particles stay above the slab below them."""

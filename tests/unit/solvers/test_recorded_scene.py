@@ -158,7 +158,7 @@ def test_a_damaged_or_missing_file_is_named(tmp_path: Path, file: str) -> None:
             read_recording(path)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not OUTSIDE.exists(), reason="needs ../shared/data/canyon.msgpack.zst")
 def test_the_outside_canyon_is_a_scene() -> None:
     state = RecordedScene(str(OUTSIDE), 0.1).sample({}, 0)

@@ -38,6 +38,7 @@ def test_is_a_scene(config):
     assert isinstance(config, SceneDistribution)
 
 
+@pytest.mark.slow
 def test_same_seed_gives_same_bytes(config):
     a, b, other = config.sample(VALUES, 5), drawn(config.cell, 5), drawn(config.cell, 4)
     for name in ("pos", "vel", "node_type", "mass", "material_params", "gravity", "rest_pos", "cells"):
@@ -46,12 +47,14 @@ def test_same_seed_gives_same_bytes(config):
     assert a.pos.tobytes() != other.pos.tobytes()
 
 
+@pytest.mark.slow
 def test_stiffness_changes_nothing_else(config):
     soft, stiff = config.sample({"solid": 5e5}, 1), config.sample({"solid": 1e7}, 1)
     assert soft.pos.tobytes() == stiff.pos.tobytes() and soft.vel.tobytes() == stiff.vel.tobytes()
     assert np.all(soft.material_params == 5e5) and np.all(stiff.material_params == 1e7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_body_is_at_rest_inside_and_free(config, seed):
     state = drawn(config.cell, seed)

@@ -149,6 +149,7 @@ def test_what_others_have_prepared_is_not_run(tmp_path: Path) -> None:
     assert own is not None and own != folder
 
 
+@pytest.mark.slow
 def test_compiled_functions_are_kept_in_the_fallback(tmp_path: Path) -> None:
     """The process cannot write to the folders of the package and home."""
     code = """

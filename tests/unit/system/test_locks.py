@@ -86,6 +86,7 @@ def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
+@pytest.mark.slow
 def test_who_waits_says_so_and_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with held_elsewhere(tmp_path / "a") as process:
         assert process.stdin is not None
@@ -95,6 +96,7 @@ def test_who_waits_says_so_and_goes_on(tmp_path: Path, caplog: pytest.LogCapture
     assert f"waiting until another command has written it (process {process.pid} on " in caplog.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", locks.RANKS)
 def test_processes_of_one_run_share_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str) -> None:
     for other in locks.RANKS:
@@ -199,6 +201,7 @@ def test_a_folder_that_cannot_be_made_names_the_key(tmp_path: Path) -> None:
         locked(tmp_path / "runs" / "a", "paths.data").__enter__()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "overrides", "folder"),
     [
@@ -277,6 +280,7 @@ def test_hydra_starts_nothing_in_a_folder_that_cannot_be_used(
     )
 
 
+@pytest.mark.slow
 def test_complete_data_are_read_where_nothing_can_be_written(tiny_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(locks, "_acquired", lambda *_: pytest.fail("reading needs no lock"))
     generate_tiny(tiny_data)

@@ -35,6 +35,7 @@ def unmade() -> Callable[[], None]:
     raise ValueError("on purpose")
 
 
+@pytest.mark.slow
 def test_each_alternative_is_made_once_in_a_process_of_its_own_and_called_there(tmp_path: Path) -> None:
     files = {name: tmp_path / name for name in ("a", "b")}
     with apart({name: partial(noting, file) for name, file in files.items()}) as calls:
@@ -50,12 +51,14 @@ def adding(number: int) -> Callable[[int], int]:
     return lambda other: number + other
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("modules", [[], [__name__]])
 def test_arguments_go_to_the_process_and_results_come_back(modules: list[str]) -> None:
     with apart({"sum": partial(adding, 3)}, modules) as calls:
         assert [calls["sum"](4), calls["sum"](-3)] == [7, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factory", [failing, unmade])
 def test_an_alternative_that_fails_is_named(factory: Callable[[], Callable[[], None]]) -> None:
     with pytest.raises(RuntimeError, match="broken: its process ended"), apart({"broken": factory}) as calls:

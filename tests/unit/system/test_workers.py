@@ -39,6 +39,7 @@ def test_a_process_that_dies() -> None:
         list(results(workers, os._exit, [(1,)]))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs groups of processes")
 @pytest.mark.parametrize("delay", [0.0, 0.2, 1.5])
 def test_an_interrupt_ends_all_of_them_at_once(tmp_path: Path, delay: float) -> None:

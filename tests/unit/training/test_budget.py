@@ -158,6 +158,7 @@ def test_a_measurement_that_fails_writes_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "t.json").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "is_other"),
     [

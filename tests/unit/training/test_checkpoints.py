@@ -147,6 +147,7 @@ def assert_like(run: Path, whole: Path) -> None:
     assert stored(run)["callbacks"]["Checkpoints"] == stored(whole)["callbacks"]["Checkpoints"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stops_at", [None, 2, 7])
 def test_a_trained_model_stays_the_best_unless_a_later_one_is(
     stops_at: int | None, data: Path, tmp_path: Path, errors: dict[int, list[float]], caplog: pytest.LogCaptureFixture
@@ -167,6 +168,7 @@ def test_a_trained_model_stays_the_best_unless_a_later_one_is(
     assert all(torch.equal(start_weights[key], value) for key, value in averaged.items())  # no step has changed them
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("warmup_steps", "warns"), [(STEPS, False), (STEPS + 1, True)])
 def test_a_training_that_ends_within_its_warm_up_says_so(
     warmup_steps: int, warns: bool, data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
@@ -175,6 +177,7 @@ def test_a_training_that_ends_within_its_warm_up_says_so(
     assert ("before the learning rate has reached training.learning_rate=0.001" in caplog.text) == warns
 
 
+@pytest.mark.slow
 def test_a_run_that_was_moved_knows_its_best_checkpoint(data: Path, tmp_path: Path, errors: dict[int, list[float]]) -> None:
     trained(data, tmp_path / "whole")
     assert stored(tmp_path / "whole", "best")["global_step"] == 3
@@ -188,6 +191,7 @@ def test_a_run_that_was_moved_knows_its_best_checkpoint(data: Path, tmp_path: Pa
     assert not (tmp_path / "here").exists()
 
 
+@pytest.mark.slow
 def test_the_latest_that_is_not_clearly_worse_is_the_best(data: Path, tmp_path: Path, errors: dict[int, list[float]]) -> None:
     errors |= {3: [1.0, 1.0, 1.0], 6: [0.8, 0.9, 1.6], 9: [1.9, 2.0, 2.2]}
     trained(data, tmp_path / "run")
@@ -215,6 +219,7 @@ def test_one_scene_has_no_standard_error() -> None:
     assert not clearly_worse([1.0], [1.0])
 
 
+@pytest.mark.slow
 def test_slow_drift_is_compared_with_the_lowest(data: Path, tmp_path: Path, errors: dict[int, list[float]]) -> None:
     errors |= {3: [1.0, 1.0], 6: [1.0, 1.4], 9: [1.3, 1.45]}  # the last is not clearly worse than the second, but than the first
     assert not clearly_worse(errors[9], errors[6])
@@ -223,6 +228,7 @@ def test_slow_drift_is_compared_with_the_lowest(data: Path, tmp_path: Path, erro
     assert stored(tmp_path / "run", "best")["global_step"] == 6
 
 
+@pytest.mark.slow
 def test_without_the_best_checkpoint_the_next_validation_makes_one(data: Path, tmp_path: Path, errors: dict[int, list[float]]) -> None:
     with pytest.raises(Killed):
         trained(data, tmp_path / "run", at={7: stop(Killed)})
@@ -231,6 +237,7 @@ def test_without_the_best_checkpoint_the_next_validation_makes_one(data: Path, t
     assert stored(tmp_path / "run", "best")["global_step"] == 9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("push_fraction", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_a_checkpoint_between_validations_is_as_good_as_any(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, push_fraction: float
@@ -248,6 +255,7 @@ def test_a_checkpoint_between_validations_is_as_good_as_any(
     assert_like(tmp_path / "parts", tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_checkpoints_between_validations_come_when_their_time_has_passed(data: Path, tmp_path: Path) -> None:
     saved = []
 
@@ -263,6 +271,7 @@ def test_checkpoints_between_validations_come_when_their_time_has_passed(data: P
     assert saved == [1, 2, 3, 4, 5, 6, 7, 8]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "step", "saved"),
     [
@@ -281,6 +290,7 @@ def test_an_interrupted_training_is_saved_where_it_is(data: Path, tmp_path: Path
     assert_like(tmp_path / "run", tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_a_second_signal_ends_it_at_once_and_what_is_there_is_named(data: Path, tmp_path: Path) -> None:
     def twice() -> None:
         send(signal.SIGINT)()
@@ -327,6 +337,7 @@ OTHERS = ["{victim}", "../../victim", "file://{victim}", "memory://victim", "{vi
 PATHS = ["local://{victim}", *(pytest.param(path, marks=pytest.mark.slow) for path in OTHERS)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", PATHS)
 def test_no_path_in_a_checkpoint_is_followed(data: Path, tmp_path: Path, errors: dict[int, list[float]], path: str) -> None:
     """All keys under which Lightning's own callback keeps paths."""
@@ -378,6 +389,7 @@ def test_a_run_folder_may_be_a_link_itself(tmp_path: Path) -> None:
     assert (tmp_path / "disk" / "config.json").exists()
 
 
+@pytest.mark.slow
 def test_checkpoints_that_are_links_are_replaced_not_followed(data: Path, tmp_path: Path) -> None:
     trained(data, tmp_path / "first")
     folder = tmp_path / "run" / "checkpoints"
@@ -391,6 +403,7 @@ def test_checkpoints_that_are_links_are_replaced_not_followed(data: Path, tmp_pa
     assert not (folder / "best.ckpt").is_symlink()
 
 
+@pytest.mark.slow
 def test_no_loss_is_missing_after_interruptions(data: Path, tmp_path: Path) -> None:
     for step in (1, 4):
         with pytest.raises(RunError, match=f"step {step + 1}$"):
@@ -400,6 +413,7 @@ def test_no_loss_is_missing_after_interruptions(data: Path, tmp_path: Path) -> N
     assert [int(row["step"]) for row in rows if row["train/loss"]] == [*range(STEPS)]
 
 
+@pytest.mark.slow
 def test_an_error_before_anything_is_restored_is_not_blamed_on_the_checkpoint(data: Path, tmp_path: Path) -> None:
     with pytest.raises(Killed):
         trained(data, tmp_path / "run", at={4: stop(Killed)})
@@ -441,6 +455,7 @@ CONTENTS: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", [pytest.param(key, marks=[] if key == "loops" else pytest.mark.slow) for key in CONTENTS])
 def test_wrong_contents_of_a_checkpoint_are_named_in_one_line(data: Path, tmp_path: Path, key: str) -> None:
     with pytest.raises(Killed):

@@ -85,11 +85,13 @@ def assert_same(model: Model, data: HeteroData) -> None:
         torch.testing.assert_close(found_gradients[key], value, rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_further_particles_change_neither_results_nor_gradients(name: str) -> None:
     assert_same(built(name, scenes.builder(MATERIALS).spec), particles())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in MODELS if name != "cconv"])
 def test_further_nodes_of_meshes_change_neither_results_nor_gradients(name: str) -> None:
     assert_same(built(name, meshes.spec(3)), meshes.graph(3))
@@ -137,6 +139,7 @@ def graphs(monkeypatch: pytest.MonkeyPatch) -> CudaGraphs:
     return found
 
 
+@pytest.mark.slow
 def test_batches_of_similar_sizes_share_a_graph(graphs: CudaGraphs) -> None:
     for seed in range(10):
         graphs.begin_step()
@@ -164,6 +167,7 @@ def test_weights_get_the_gradients(graphs: CudaGraphs) -> None:
         torch.testing.assert_close(expected[key], value, rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_only_the_first_call_of_a_step_uses_a_graph(graphs: CudaGraphs, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
     fill = FilledArguments.fill
@@ -202,6 +206,7 @@ def test_moved_weights_need_a_new_graph(graphs: CudaGraphs) -> None:
     assert graphs.num_made == 2
 
 
+@pytest.mark.slow
 def test_training_goes_on_where_graphs_cannot_be_made(
     graphs: CudaGraphs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -201,6 +201,7 @@ def test_many_bad_batches_end_a_run() -> None:
         m.training_step(data, 0)
 
 
+@pytest.mark.slow
 def test_bad_batches_far_apart_do_not_add_up() -> None:
     m, data = module(), batch()
     data["sand"].target[3, 1] = torch.nan

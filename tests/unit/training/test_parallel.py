@@ -280,6 +280,7 @@ def test_numbers_that_go_bad_on_one_rank_are_skipped_on_all_and_stop_all(mixed: 
     assert "step 4: the loss is nan for (trajectory, frame) = (3, 17), (4, 17)" in messages[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clip", [1.0, None])
 def test_a_loss_that_overflows_changes_no_weight_though_its_gradient_is_finite(tmp_path: Path, clip: float | None) -> None:
     """Its square is beyond single precision, its gradient is not. Ranks compute gradients nevertheless, because they wait for each other's."""
@@ -300,6 +301,7 @@ def test_a_loss_that_overflows_changes_no_weight_though_its_gradient_is_finite(t
     assert on_ranks(tmp_path, on_rank) == [(True, True), (True, True)]
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_is_reported_in_one_line_with_where_to_resume(
     mixed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -333,6 +335,7 @@ def test_processes_that_were_started_end_before_lightning_notices() -> None:
     assert process.returncode == -signal.SIGKILL and watched == []
 
 
+@pytest.mark.slow
 def test_a_second_training_on_several_devices_is_refused(mixed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lightning would start no processes for it, and wait for them."""
     monkeypatch.setattr(SummedGradients, "has_started_processes", True)
@@ -340,6 +343,7 @@ def test_a_second_training_on_several_devices_is_refused(mixed: Path, tmp_path: 
         trained(mixed, tmp_path / "run", 0, 2, BatchSize(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "message"),
     [(BatchSize(1), r"training.batch_size=1: too small for 2"), (BatchSize(3, 59), r"max_nodes=59: .*of up to 30 nodes")],

@@ -190,6 +190,7 @@ def losses(data: TrajectoryDataModule, name: str, num_steps: int) -> list[float]
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "dim", "mesh"), [("GNS", 2, False), ("ContinuousConvNet", 2, False), ("GPE", 3, False), ("GPE", 2, True), ("DPINet", 2, True)]
 )
@@ -202,12 +203,14 @@ def test_every_model_and_meshes_train_the_same(name: str, dim: int, mesh: bool, 
 DECIMAL = [(1e-6, 1e4), (1e-3, 1.0), (1e6, 1e-4), (1e-6, 1e-4), (1e6, 1e4)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("length", "time"), [DECIMAL[0], *(pytest.param(*factors, marks=pytest.mark.slow) for factors in DECIMAL[1:])])
 def test_decimal_units_change_the_first_losses_by_rounding_only(length: float, time: float, folder: Path) -> None:
     expected = losses(data(folder, 1.0, 1.0), "GPE", 10)
     np.testing.assert_allclose(losses(data(folder, length, time), "GPE", 10), expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("still", [False, True])
 def test_limits_of_evaluated_rollouts_follow_the_scene(still: bool, folder: Path) -> None:
     guards = []

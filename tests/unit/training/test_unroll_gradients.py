@@ -139,6 +139,7 @@ def test_a_rollout_may_be_the_first_to_see_a_mesh() -> None:
     assert math.isfinite(float(loss))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_gradients_of_three_steps_equal_finite_differences(name: str) -> None:
     model, settings, builder, scene = case(name)

@@ -70,6 +70,7 @@ def test_everything_can_be_given() -> None:
     assert {tuple(normal) for normal in t.boundary.normal} == {(1.0, 0.0), (-1.0, 0.0)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("material", "value"),
     [
@@ -293,6 +294,7 @@ def test_the_spacing_of_a_lattice() -> None:
 # --- data sets -----------------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_data_set_of_trajectories(tmp_path: Path) -> None:
     fluid = [trajectory(seed=k, materials="fluid", params={"fluid": 0.1 * k}) for k in (1, 2)]
     test = [trajectory(seed=5, materials=["sand", "fluid"] * 10, params={"sand": 20, "fluid": 0.15})]
@@ -314,6 +316,7 @@ def test_a_data_set_of_trajectories(tmp_path: Path) -> None:
     assert statistics["acceleration_std"] > 0
 
 
+@pytest.mark.slow
 def test_trajectories_are_made_when_they_are_asked_for(tmp_path: Path) -> None:
     """A data set that does not fit into memory."""
 

@@ -69,6 +69,7 @@ def spinning(backend: str) -> State:
     return state.to_torch() if backend == "torch" else state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
 def test_bodies_keep_shape_momentum_and_spin_over_many_steps_and_other_nodes_are_free(backend: str) -> None:
     start = state = spinning(backend)
@@ -127,6 +128,7 @@ def test_a_body_is_marked_as_a_whole_or_not_at_all() -> None:
     assert all_of_bodies(mask, None) is mask
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
 @pytest.mark.parametrize("sides", [(1, 1, 1), (1, 0.5, 0.2), (1, 0.1, 0.1)])
 def test_a_body_asked_for_too_large_a_turn_gets_the_largest_fraction_of_its_angular_momentum(

@@ -120,6 +120,7 @@ def test_node_types_are_stored_by_name(shard: Path, trajectory: Trajectory) -> N
     assert {NODE_TYPES[k] for k in read_trajectory(shard, "00000").node_type} == {"sand"}
 
 
+@pytest.mark.slow
 def test_equal_content_gives_equal_bytes(tmp_path: Path, trajectory: Trajectory) -> None:
     write_shard(tmp_path / "a.h5", [trajectory, trajectory])
     time.sleep(1.1)  # HDF5's time stamps count whole seconds

@@ -56,6 +56,7 @@ BROKEN = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("key", "index", "value", "message"), BROKEN)
 def test_what_breaks_a_rule_is_refused_everywhere(
     tmp_path: Path, trajectory: Trajectory, key: str, index: Any, value: float, message: str, caplog: pytest.LogCaptureFixture

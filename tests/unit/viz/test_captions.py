@@ -85,6 +85,7 @@ def test_ground_truth_is_called_so(tmp_path: Path) -> None:
     assert page(tmp_path / "a.html") == ("A <test>: ground truth, GPE", f"A <test> {SAND}", ["ground truth", "GPE"])
 
 
+@pytest.mark.slow
 def test_films_say_what_they_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: dict[str, None] = {}  # a GIF is drawn twice, first for its palette
 
@@ -101,6 +102,7 @@ def test_films_say_what_they_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert [*drawn] == ["GPE", f"{SAND}; colour: height at the start", ""]
 
 
+@pytest.mark.slow
 def test_contact_sheets_name_values_where_they_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "sand, friction angle 27.5°; colour: height at the start" in texts(contact_sheet({"a": truth(), "b": truth()}))
     assert "sand; colour: height at the start" in texts(contact_sheet({"20°": truth(20.0), "30°": truth(30.0)}))
@@ -143,6 +145,7 @@ def test_a_stored_prediction_stays_one(tmp_path: Path) -> None:
     assert [read_trajectory(tmp_path / "a.h5", name).is_prediction for name in ("00000", "00001")] == [False, True]
 
 
+@pytest.mark.slow
 def test_a_distance_between_predictions_is_no_error() -> None:
     bars = [rollout_figure(first, {"other": predicted()}, color="error").axes[-1].get_ylabel() for first in (truth(), predicted())]
     assert [" ".join(label.split("\n")) for label in bars] == ["position error [m]", "distance from the first rollout [m]"]

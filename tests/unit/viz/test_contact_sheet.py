@@ -35,6 +35,7 @@ def test_nodes_that_are_not_in_an_open_scene_are_not_drawn(tmp_path):
     assert len(row.collections[0].get_offsets()) == there[0]
 
 
+@pytest.mark.slow
 def test_a_row_per_trajectory_and_a_column_per_time(ground_truth, dim):
     rows = {f"friction angle\n{angle} deg": ground_truth for angle in (20, 30)} | {"half": with_fewer_nodes(ground_truth)}
     figure = contact_sheet(rows, num_columns=4)
@@ -77,6 +78,7 @@ def are_apart(boxes) -> bool:
     return all(a.x1 <= b.x0 or b.x1 <= a.x0 or a.y1 <= b.y0 or b.y1 <= a.y0 for a, b in combinations(boxes, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [[], ["second"], ["one", "two", "a longer name"]])
 def test_labels_and_notes_of_flat_scenes_have_room(rows):
     figure = flat_figure(rows)
@@ -90,6 +92,7 @@ def test_labels_and_notes_of_flat_scenes_have_room(rows):
         assert not axes.texts[0].get_text() or note.y0 >= axes.bbox.y1 - 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_prediction", [False, True])
 def test_the_colour_bar_of_a_flat_scene_can_be_read(is_prediction):
     flat = falling(2)
@@ -104,6 +107,7 @@ def test_the_colour_bar_of_a_flat_scene_can_be_read(is_prediction):
         assert whole.y0 <= label.y0 and label.y1 <= whole.y1 and label.x1 <= whole.x1
 
 
+@pytest.mark.slow
 def test_notes_stay_within_their_panel(ground_truth):
     pos = ground_truth.pos.copy()
     pos[5:, :5, -1], pos[5:, 5:7] = 3.0, np.nan
@@ -115,6 +119,7 @@ def test_notes_stay_within_their_panel(ground_truth):
     assert sum(bool(axes.texts[0].get_text()) for axes in figure.axes[:-1]) == 3
 
 
+@pytest.mark.slow
 def test_stress_has_a_colour_bar_in_engineering_units(mesh):
     figure = contact_sheet({"0.5 MPa": mesh, "1 MPa": mesh}, num_columns=3)
     assert len(figure.axes) == 2 * 3 + 1
@@ -147,6 +152,7 @@ def test_a_row_that_stopped_says_so(ground_truth):
     assert [axes.texts[0].get_text() for axes in figure.axes] == ["", "", "", "stopped at 0.10 s\n(nan)", "", "not simulated"]
 
 
+@pytest.mark.slow
 def test_short_times_are_told_apart(ground_truth):
     quick = replace(ground_truth, metadata=replace(ground_truth.metadata, frame_dt=1e-3))
     assert texts(contact_sheet({"a": quick}, num_columns=12))[1:4] == ["$t$ = 0.000 s", "0.001 s", "0.002 s"]

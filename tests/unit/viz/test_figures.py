@@ -18,6 +18,7 @@ def colourful(image) -> np.ndarray:
     return np.ptp(image, axis=-1) > 20
 
 
+@pytest.mark.slow
 def test_rollout_figure_has_a_panel_per_time_and_row(ground_truth, prediction):
     figure = rollout_figure(ground_truth, {"GPE": prediction, "GNS": prediction}, num_columns=4)
     assert len(figure.axes) == 3 * 4 + 1  # and the colour bar
@@ -27,6 +28,7 @@ def test_rollout_figure_has_a_panel_per_time_and_row(ground_truth, prediction):
     assert {"$t$ = 0.00 s", "0.22 s", "ground\ntruth", "GPE", "GNS"} <= set(texts)
 
 
+@pytest.mark.slow
 def test_parameter_strip_has_the_model_below_the_solver(ground_truth, prediction):
     figure = parameter_strip([("20°", ground_truth, prediction), ("25°\n(unseen)", prediction, ground_truth)], num_columns=3)
     assert len(figure.axes) == 4 * 3
@@ -37,6 +39,7 @@ def test_few_frames_give_few_columns(ground_truth):
     assert len(rollout_figure(ground_truth.frames(0, 3), {}, num_columns=6).axes) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("color", ["error", "height"])
 def test_every_panel_shows_particles(ground_truth, prediction, color):
     figure = rollout_figure(ground_truth, {"GPE": prediction}, num_columns=3, color=color)
@@ -66,6 +69,7 @@ def test_error_colours_grow_with_the_error(ground_truth, prediction, dim):
     assert brightness[error.argmax()] > brightness[error.argmin()] + 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.0123, 0.0234, 0.123])
 def test_the_label_of_the_error_bar_is_within_the_figure(ground_truth, size):
     moved = replace(ground_truth, pos=ground_truth.pos + np.float32(size / 2**0.5), is_prediction=True)

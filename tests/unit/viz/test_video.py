@@ -24,6 +24,7 @@ def particles(image) -> np.ndarray:
     return np.argwhere(np.ptp(image, axis=-1) > 40)
 
 
+@pytest.mark.slow
 def test_gif_has_every_frame_and_particles_fall_in_both_panels(tmp_path, ground_truth, prediction):
     path = tmp_path / "new" / "rollout.gif"
     write_animation(path, ground_truth, {"GPE": prediction}, fps=20)
@@ -46,6 +47,7 @@ def test_the_clock_tells_short_frames_apart(tmp_path, ground_truth):
     assert len(frames_of(tmp_path / "a.gif")) == 5
 
 
+@pytest.mark.slow
 def test_moved_particles_leave_no_trace(tmp_path, ground_truth):
     write_animation(tmp_path / "a.gif", ground_truth, {})
     write_animation(tmp_path / "b.gif", ground_truth, {}, stride=ground_truth.num_frames - 1)
@@ -54,6 +56,7 @@ def test_moved_particles_leave_no_trace(tmp_path, ground_truth):
     assert tuple(last[40, 20]) == (255, 255, 255) or tuple(last[-3, 3]) == (255, 255, 255)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("color", ["height", "speed"])
 def test_colours_of_a_gif_are_those_of_its_scale(tmp_path, ground_truth, color):
     """Far nodes are paler and edges darker than the scale; none may look like what has no value."""
@@ -72,6 +75,7 @@ def test_colours_of_a_gif_are_those_of_its_scale(tmp_path, ground_truth, color):
         assert not (looks_neutral & (np.abs(true - neutral).max(axis=-1) > 16)).any()
 
 
+@pytest.mark.slow
 def test_stride_skips_frames_and_errors_have_colours(tmp_path, ground_truth, prediction):
     write_animation(tmp_path / "a.gif", ground_truth, {"GPE": prediction}, stride=5, color="error")
     frames = frames_of(tmp_path / "a.gif")
@@ -80,6 +84,7 @@ def test_stride_skips_frames_and_errors_have_colours(tmp_path, ground_truth, pre
     assert ((right[..., 0] > 200) & (right[..., 2] < 120)).any()  # large errors are yellow, which the first frame lacks
 
 
+@pytest.mark.slow
 def test_a_stopped_rollout_empties_its_panel(tmp_path, ground_truth, stopped):
     write_animation(tmp_path / "a.gif", ground_truth, {"GPE": stopped})
     frames = frames_of(tmp_path / "a.gif")
@@ -88,6 +93,7 @@ def test_a_stopped_rollout_empties_its_panel(tmp_path, ground_truth, stopped):
     assert len(particles(right)) == 0 and (right < 150).any()
 
 
+@pytest.mark.slow
 def test_mp4_can_be_read_back(tmp_path, ground_truth, prediction):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     path = tmp_path / "a.mp4"
@@ -120,6 +126,7 @@ def test_senseless_requests_are_refused(tmp_path, ground_truth, name, options, m
         write_animation(tmp_path / name, ground_truth, {}, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")
 def test_a_film_that_does_not_fit_is_refused_and_leaves_nothing(tmp_path, ground_truth):
     """ffmpeg only says so by a file without frames."""

@@ -48,6 +48,7 @@ def bad(faults: list[Fault], folder: Path) -> list[tuple[str, str, Verdict]]:
 # --- what is wrong is refused ---------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.long)])
 def test_damaged_and_wrong_shards(shard: Path, tmp_path: Path, step: int) -> None:
     faults = stores.faults(shard, 16)
@@ -55,6 +56,7 @@ def test_damaged_and_wrong_shards(shard: Path, tmp_path: Path, step: int) -> Non
     assert not bad(faults[::step], tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [8, pytest.param(1, marks=pytest.mark.long)])
 def test_damaged_wrong_and_hostile_checkpoints(checkpoint: Path, tmp_path: Path, step: int) -> None:
     faults = checkpoints.faults(checkpoint, 16)
@@ -78,6 +80,7 @@ def test_every_bit_of_a_weight_counts(checkpoint: Path, tmp_path: Path) -> None:
     assert "checksum mismatch" in verdict.detail
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learned", [False, True], ids=["solver", "model"])
 def test_impossible_scenes(spec: DatasetSpec, tmp_path: Path, learned: bool) -> None:
     every = [f for f in scenes.faults({"sand": spec}, 1) if ("model" in f.name) is learned]
@@ -85,6 +88,7 @@ def test_impossible_scenes(spec: DatasetSpec, tmp_path: Path, learned: bool) -> 
     assert not bad(every, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [23, pytest.param(1, marks=pytest.mark.long)])
 def test_values_that_break_a_rule(shard: Path, tmp_path: Path, step: int) -> None:
     faults = field_values.faults({"sand": shard})
@@ -93,6 +97,7 @@ def test_values_that_break_a_rule(shard: Path, tmp_path: Path, step: int) -> Non
     assert not bad(faults[::step], tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [19, pytest.param(1, marks=pytest.mark.long)])
 def test_small_files_and_archives(tmp_path: Path, step: int) -> None:
     side_files.raw_arrays(tmp_path / "raw")

@@ -82,6 +82,7 @@ HOLDS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stress_test", HOLDS, ids=lambda t: str(t.number) if isinstance(t, StressTest) else None)
 def test_what_holds_by_construction_holds_before_training(spec: DatasetSpec, scenes: list[Trajectory], stress_test: StressTest) -> None:
     outcome = stress_test(subject(spec, scenes, **SHIPPED))
@@ -139,6 +140,7 @@ def test_an_exploding_model_fails(spec: DatasetSpec, scenes: list[Trajectory]) -
     assert all(f <= 2 for f in outcome.curves["steps_to_failure"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 2, 3, 4, 7])
 def test_a_model_that_answers_nan_fails(spec: DatasetSpec, scenes: list[Trajectory], monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     """Only the first comparison is finite, so the largest by ``max`` would be that one."""
@@ -295,6 +297,7 @@ def test_a_body_that_swings_is_not_at_rest_where_it_turns(
     assert isinstance(horizon.settle(own), State)
 
 
+@pytest.mark.slow
 def test_verdicts_are_stored_beside_the_checkpoint_and_completed(
     spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -320,6 +323,7 @@ def test_verdicts_are_stored_beside_the_checkpoint_and_completed(
     assert stored(1) == "Passes 1 of 1 stress tests"  # another checkpoint keeps nothing
 
 
+@pytest.mark.slow
 def test_failures_of_gating_models_fail_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     records = [
         {"domain": "sand", "model": f"{status} {gating}", "test": "3 x", "status": status, "gating": gating}

@@ -168,6 +168,7 @@ def test_nodes_can_be_held_along_some_axes(tmp_path: Path) -> None:
 ELEMENTS = "\n".join(f"{k}, {', '.join(str(IDS[node]) for node in cell)}" for k, cell in enumerate(CELLS, start=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lines",
     [
@@ -299,6 +300,7 @@ def test_what_cannot_be_read_is_refused_by_name(
         imported(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "load",
     [
@@ -361,6 +363,7 @@ def test_missing_results_are_named(tmp_path: Path) -> None:
 needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed (Debian: apt-get install calculix-ccx)")
 
 
+@pytest.mark.slow
 @needs_ccx
 def test_results_of_calculix_itself(tmp_path: Path) -> None:
     """A cube that is clamped at one face and pulled at the other first accelerates by force over mass of its free half."""
@@ -423,7 +426,7 @@ SMALL = {"cantilever": {"cells": (8, 2, 2), "num_frames": 40}, "plate": {"cells"
 
 @needs_ccx
 @pytest.mark.slow
-@pytest.mark.parametrize("case", SMALL)
+@pytest.mark.parametrize("case", ["cantilever", pytest.param("plate", marks=pytest.mark.long)])
 def test_a_short_training_answers_what_calculix_does(tmp_path: Path, case: str) -> None:
     """Deflection within 10 % and peak stress within 25 % of their largest values in the mean over time, in a scene with an unseen modulus and load."""
     made = decks()

@@ -22,6 +22,7 @@ def motion_of(trajectory: Trajectory) -> BoundaryMotion:
     return trajectory.boundary.motion
 
 
+@pytest.mark.slow
 def test_rigid_cubes(tmp_path: Path) -> None:
     for k in range(3):
         pos = motion(num_nodes=128, dim=3, seed=k)
@@ -44,6 +45,7 @@ def turned(angle: float) -> np.ndarray:
     return np.array([0.0, np.sin(angle / 2), 0.0, np.cos(angle / 2)], np.float32)
 
 
+@pytest.mark.slow
 def test_grippers_are_moving_walls(tmp_path: Path) -> None:
     for k in range(3):
         pos = motion(num_nodes=60, dim=3, seed=k)
@@ -72,6 +74,7 @@ def test_grippers_are_moving_walls(tmp_path: Path) -> None:
     assert any("clusterStiffness" in note for note in report.notes)
 
 
+@pytest.mark.slow
 def test_a_shaken_box_moves(tmp_path: Path) -> None:
     width, depth = 0.7, 0.2
     side, face, middle = width / 2 + 0.0125, depth / 2 + 0.0125, 0.5125
@@ -95,6 +98,7 @@ def test_a_shaken_box_moves(tmp_path: Path) -> None:
     np.testing.assert_allclose(walls.pos[5] - walls.pos[0], way, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_ground_is_at_zero_unless_a_node_is_below(tmp_path: Path) -> None:
     for name, lift in (("above", 0.0), ("below", 0.35)):
         for k in range(3):
@@ -107,6 +111,7 @@ def test_the_ground_is_at_zero_unless_a_node_is_below(tmp_path: Path) -> None:
             np.testing.assert_allclose(trajectory.boundary.pos[:, 1], min(0.0, lowest), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_damaged_first_file_does_not_hide_the_walls_of_a_bath(tmp_path: Path) -> None:
     for k in range(4):
         pos = rigid(motion(num_nodes=80, dim=3, seed=k), slice(0, 64))
@@ -117,6 +122,7 @@ def test_a_damaged_first_file_does_not_hide_the_walls_of_a_bath(tmp_path: Path) 
     assert [event.trajectory for event in report.refusals] == ["train/0"]
 
 
+@pytest.mark.slow
 def test_a_rollout_of_another_environment_is_refused(tmp_path: Path) -> None:
     for k in range(5):
         pos, extra = motion(num_nodes=80, dim=3, seed=k), {}

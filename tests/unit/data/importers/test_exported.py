@@ -46,6 +46,7 @@ def test_exported_trajectories_come_back(tmp_path: Path, scenes: list[Trajectory
         assert (after.metadata.bounds, after.metadata.gravity) == (before.metadata.bounds, before.metadata.gravity)
 
 
+@pytest.mark.slow
 def test_rollouts_of_models_are_no_ground_truth(tmp_path: Path, scenes: list[Trajectory]) -> None:
     """Evaluations write them beside the ground truth, and a holdout would take them as validation and test."""
     folder = exported(tmp_path / "raw", scenes)

@@ -84,6 +84,7 @@ def test_gns_records(tmp_path: Path, particles: list[tuple[np.ndarray, np.ndarra
     check_particles(*imported(tmp_path, tmp_path / "raw", "gns"), particles)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packed", [False, True])
 def test_gns_archives(tmp_path: Path, particles: list[tuple[np.ndarray, np.ndarray]], packed: bool) -> None:
     sources.gns_metadata(tmp_path / "raw", particles[0][0], sequence_length=10)
@@ -153,6 +154,7 @@ def drift(seed: int = 0, dim: int = 2, num_nodes: int = 20) -> np.ndarray:
     return pos % np.float32(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_lagrangebench(tmp_path: Path, dim: int) -> None:
     sources.lagrangebench_metadata(tmp_path / "raw", dim)
@@ -175,6 +177,7 @@ def test_lagrangebench(tmp_path: Path, dim: int) -> None:
     assert not report.repairs
 
 
+@pytest.mark.slow
 def test_lagrangebench_viscosity_is_stored_as_it_is(tmp_path: Path) -> None:
     for value, stored_value in ((1e-7, 1e-7), (50.0, 50.0), (0, 1e-3)):
         raw = tmp_path / f"{value}"
@@ -234,6 +237,7 @@ def test_a_description_that_the_data_contradict_is_doubted(tmp_path: Path) -> No
     assert "dim = 3 in metadata.json, but bounds have 2 axes, as the data must" in report.warnings
 
 
+@pytest.mark.slow
 def test_the_force_of_a_dam_break_is_gravity(tmp_path: Path) -> None:
     for case, gravity in (("DB", (0.0, -1.0)), ("RPF", (0.0, 0.0))):
         raw = tmp_path / case
@@ -260,6 +264,7 @@ def test_positions_outside_a_periodic_domain_are_folded(tmp_path: Path) -> None:
 # --- MeshGraphNets -------------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("container", ["tfrecord", "h5"])
 @pytest.mark.parametrize("as_boundary", [True, False])
 def test_meshgraphnets(tmp_path: Path, container: str, as_boundary: bool) -> None:
@@ -315,6 +320,7 @@ def test_a_mesh_of_tetrahedra(tmp_path: Path) -> None:
     assert "stress of the source is von Mises' only: left out" in report.notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [2, 3])
 def test_a_cloth_of_quadrilaterals(tmp_path: Path, axes: int) -> None:
     """Four corners are no tetrahedron where the mesh lies in a plane."""
@@ -367,6 +373,7 @@ def test_a_plate_that_an_actuator_deforms(tmp_path: Path) -> None:
 # --- DPI-Net -------------------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_dpinet(tmp_path: Path) -> None:
     rollouts = [sources.rigid(motion(num_nodes=80, dim=3, seed=k), slice(0, 64)) for k in range(4)]
     for k, pos in enumerate(rollouts):
@@ -410,6 +417,7 @@ def falling_blobs(gravity: float, dt: float, seed: int = 0) -> np.ndarray:
     return pos.astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("real", "settings"), [(-0.1, {}), (-9.8, {}), (-0.1, {"gravity": [0.0, -9.8, 0.0]})])
 def test_free_flight_tells_the_gravity_that_dpinet_does_not(tmp_path: Path, real: float, settings: dict[str, Any]) -> None:
     for k in range(4):
@@ -487,6 +495,7 @@ def test_parts_are_joined_by_number(tmp_path: Path, numbered: bool) -> None:
     assert not report.refusals
 
 
+@pytest.mark.slow
 def test_trajectories_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     for folder in ("arrays", "groups"):
         (tmp_path / folder).mkdir()
@@ -507,6 +516,7 @@ def test_natural_order() -> None:
     assert ordered == ["", "9", "10", "a", "a2b9", "a2b10", "traj01", "traj1", "traj10", f"traj{'9' * 5000}", "²"]
 
 
+@pytest.mark.slow
 def test_a_wrong_frame_dt_is_noticed(tmp_path: Path) -> None:
     for k in range(3):
         pos = motion(dim=3, seed=k)
@@ -533,6 +543,7 @@ def test_two_dimensional_scenes_lose_their_third_coordinate(tmp_path: Path) -> N
     assert "third coordinate never changes" in report.repairs[0].what
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not CANYON.exists(), reason="needs the outside data")
 def test_the_canyon(tmp_path: Path) -> None:
     """A real file, whose content its description gives."""

@@ -18,6 +18,7 @@ from tests.sources import DT, motion
 # --- one bad trajectory must not end the import of the others ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
@@ -52,6 +53,7 @@ def test_packed_trajectories_that_are_none(tmp_path: Path) -> None:
         refused(tmp_path, "gns", "train.npz: gns_data is a single (int|dict), expected an array of trajectories", allow_pickle=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("frame_id", "message"),
     [
@@ -69,6 +71,7 @@ def test_a_frame_number_that_is_none(tmp_path: Path, frame_id: Any, message: str
     assert re.search(f"^train, scene, {message}", only_refusal(report)), only_refusal(report)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [ValueError, TypeError, IndexError, KeyError, OverflowError, ZeroDivisionError, AttributeError])
 def test_what_no_reader_has_foreseen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]) -> None:
     from gpe_pl.data.importers import dmcf
@@ -87,6 +90,7 @@ def test_what_no_reader_has_foreseen(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert text.startswith(f"train, 2: cannot be read ({error.__name__}: ") and "no idea" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -117,6 +121,7 @@ def test_bounds_of_other_axes_are_refused_trajectory_by_trajectory(tmp_path: Pat
 # --- bombs ---------------------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_file_that_blows_up_is_not_unpacked(tmp_path: Path) -> None:
     """At most 1032 times the size of a file is unpacked; this one has a gigabyte of zeros in 30 kB."""
     import tracemalloc
@@ -172,6 +177,7 @@ def test_another_number_of_frames_than_described(tmp_path: Path) -> None:
     assert report.warnings[0] == "dim = 3 in metadata.json, but bounds have 2 axes, which were taken"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [9, 10])
 def test_the_number_of_frames_or_one_less(tmp_path: Path, records: list[bytes], length: int) -> None:
     sources.gns_metadata(tmp_path / "raw", motion(), sequence_length=length)
@@ -179,6 +185,7 @@ def test_the_number_of_frames_or_one_less(tmp_path: Path, records: list[bytes], 
     assert not any("sequence_length" in w for w in convert(tmp_path, "gns").warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("container", ["tfrecord", "h5"])
 def test_meshes_of_another_number_of_frames_than_described(tmp_path: Path, container: str) -> None:
     cloths = [sources.sheet(seed=k, num_frames=12) for k in range(3)]

@@ -182,6 +182,7 @@ def test_an_archive_compressed_in_another_way(tmp_path: Path) -> None:
     refused(tmp_path, "arrays", "is compressed in another way than NumPy does")
 
 
+@pytest.mark.slow
 def test_an_archive_that_blows_up(tmp_path: Path) -> None:
     (tmp_path / "raw").mkdir()
     with zipfile.ZipFile(tmp_path / "raw" / "a.npz", "w", zipfile.ZIP_BZIP2) as archive:

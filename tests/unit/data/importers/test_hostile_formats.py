@@ -85,6 +85,7 @@ def rollouts(tmp_path: Path) -> Path:
     return tmp_path / "raw" / "train" / "2"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -167,6 +167,7 @@ def test_a_record_that_cannot_be_used(tmp_path: Path, records: list[bytes], data
     assert re.search(message, text), text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("data", "message"),
     [

@@ -30,6 +30,7 @@ def left(raw: Path) -> list[str]:
     return sorted(path.name for path in (raw.parent / "data").rglob("*") if path.is_file() and not path.name.endswith((".lock", ".holder")))
 
 
+@pytest.mark.slow
 def test_one_that_ends_while_it_draws(raw: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Killed(BaseException):
         pass

@@ -82,6 +82,7 @@ def test_an_array_that_unpacks_to_far_more_than_is_stored_is_refused(tmp_path: P
         npz.read(tmp_path / "a.npz", "pos")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("key", "dtype"), [("frame_dt", "<f4"), ("materials", "<U1"), ("params_fluid", "<f4"), ("bounds", "<f4")])
 def test_values_for_more_nodes_than_there_are_are_not_read(tmp_path: Path, key: str, dtype: str) -> None:
     raw_arrays(tmp_path / "raw")

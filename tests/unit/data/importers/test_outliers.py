@@ -37,10 +37,12 @@ def report(folder: Path, trajectories: list[dict[str, Any]], **settings: Any) ->
     return imported(folder / "sets", folder / "raw", "arrays", **settings)[0]
 
 
+@pytest.mark.slow
 def test_alike_trajectories_are_not_suspects(tmp_path: Path) -> None:
     assert not warnings(tmp_path, [flying(k) for k in range(6)])
 
 
+@pytest.mark.slow
 def test_another_unit_of_length(tmp_path: Path) -> None:
     said = warnings(tmp_path, [flying(k, **({"pos": 1000 * flying(k)["pos"]} if k == 2 else {})) for k in range(6)])
     assert any(
@@ -48,6 +50,7 @@ def test_another_unit_of_length(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_trajectory_that_was_cut_off(tmp_path: Path) -> None:
     said = warnings(tmp_path, [flying(k, **({"pos": flying(k)["pos"][:26]} if k == 1 else {})) for k in range(6)])
     assert said == ["train, 1.npz: has 26 frames, most trajectories have 30: was it cut off?"]
@@ -57,6 +60,7 @@ def test_lengths_that_all_differ_are_no_fault(tmp_path: Path) -> None:
     assert not warnings(tmp_path, [flying(k, pos=flying(k)["pos"][: 30 - k]) for k in range(5)])
 
 
+@pytest.mark.slow
 def test_gravity_with_the_wrong_sign_in_one_trajectory(tmp_path: Path) -> None:
     said = warnings(tmp_path, [flying(k, **({"gravity": [0.0, -GRAVITY]} if k == 1 else {})) for k in range(6)])
     (what,) = said
@@ -64,6 +68,7 @@ def test_gravity_with_the_wrong_sign_in_one_trajectory(tmp_path: Path) -> None:
     assert "groups in free flight agree on (0, -9.8" in what
 
 
+@pytest.mark.slow
 def test_a_body_that_pulsates_is_not_rigid(tmp_path: Path) -> None:
     body = np.zeros(36, int)
     sound = [flying(k, rigid_body=body) for k in range(4)]
@@ -105,11 +110,13 @@ def test_numbers_of_bodies_that_do_not_fit_are_refused(number: int) -> None:
     np.testing.assert_array_equal(checked_bodies(np.array([3], np.uint8), 1), [3])
 
 
+@pytest.mark.slow
 def test_a_trajectory_of_one_node_has_no_spacing_to_suspect(tmp_path: Path) -> None:
     lonely = {**flying(5), "pos": flying(5)["pos"][:, :1]}
     assert not any("unit of length" in w for w in warnings(tmp_path, [*(flying(k) for k in range(5)), lonely]))
 
 
+@pytest.mark.slow
 def test_wrong_motion_is_noticed_in_late_trajectories_too(tmp_path: Path) -> None:
     time = DT * np.arange(LANDS)[:, None, None]
     fast = flying(9)

@@ -95,6 +95,7 @@ def test_unseen_splits_and_folders_that_are_none(tmp_path: Path) -> None:
     assert any(w.startswith("train_more/ was not read") for w in report.warnings)
 
 
+@pytest.mark.slow
 def test_a_scene_that_is_in_two_splits_stays_in_training(tmp_path: Path) -> None:
     for folder, seeds in {"train": (0, 1, 2), "test": (2, 3), "val": (4,)}.items():
         for seed in seeds:

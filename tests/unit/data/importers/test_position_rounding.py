@@ -47,6 +47,7 @@ def stored(report: Report) -> list[Trajectory]:
     return [t for split in ("train", "test", "val") for t in iter_trajectories(Path(report.folder), split)]
 
 
+@pytest.mark.slow
 def test_far_from_the_origin_accelerations_survive(tmp_path: Path) -> None:
     near = [swinging(seed) for seed in range(4)]
     here = converted(tmp_path, "near", near)
@@ -124,6 +125,7 @@ def test_a_periodic_domain_moves_too(tmp_path: Path) -> None:
     np.testing.assert_allclose(stored(report)[0].vel, expected.vel, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("precision", "offset"), [(np.float16, 0.0), (np.float32, 5000.0)])
 def test_the_input_is_too_coarse(tmp_path: Path, precision: Any, offset: float) -> None:
     """Whatever type such numbers come in: what was rounded away does not come back."""
@@ -204,6 +206,7 @@ def test_crossing_the_seam_is_no_jump(tmp_path: Path) -> None:
     assert not any("moves by" in w for w in report.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
 @pytest.mark.parametrize("step", [1e-3, 1 / 640], ids=["three decimals", "pixels"])
 def test_positions_with_few_digits_are_named(tmp_path: Path, step: float, precision: type) -> None:

@@ -45,6 +45,7 @@ A, B, C = (recording(seed) for seed in range(3))
 PART = "1 of 1 trajectories is of a recording that is also in another split, the first is "
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("train", "val", "said"),
     [
@@ -67,16 +68,19 @@ def test_parts_of_one_recording(tmp_path: Path, train: np.ndarray, val: np.ndarr
     assert [w.split(": errors there")[0] for w in found] == ([] if said is None else [f"val: {PART}{said}"])
 
 
+@pytest.mark.slow
 def test_parts_may_be_in_one_split(tmp_path: Path) -> None:
     assert not warnings(tmp_path, train=[A[:20], A[20:]], val=[B], test=[C])
 
 
+@pytest.mark.slow
 def test_splits_that_the_import_chooses_count(tmp_path: Path) -> None:
     """The last training trajectories become val and test."""
     (what,) = warnings(tmp_path, train=[B, C, A[:20], A[20:]])
     assert what.startswith(f"test: {PART}train2.npz, which goes on before val, train3.npz: ")
 
 
+@pytest.mark.slow
 def test_every_part_is_counted(tmp_path: Path) -> None:
     (what,) = warnings(tmp_path, train=[A[:20], B[:20]], val=[A[20:], C, B[10:]], test=[recording(7)])
     assert what.startswith(

@@ -39,6 +39,7 @@ def test_a_lone_split_becomes_train(tmp_path: Path) -> None:
     assert "graph.history=1 takes one, and evaluation.start_time=0" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [

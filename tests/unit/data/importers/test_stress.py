@@ -64,6 +64,7 @@ def test_without_a_stress_there_are_no_channels(tmp_path: Path) -> None:
     assert GraphBuilder(GraphConfig(), solid.metadata).spec.stress_channels == {}
 
 
+@pytest.mark.slow
 def test_trajectories_without_a_stress_do_not_count_for_the_splits(tmp_path: Path) -> None:
     """They would fill a shard, and be those that are held out."""
     train = [stressed(k, has_stress=k < 8) for k in range(20)]

@@ -75,6 +75,7 @@ def test_boxes_along_the_edges_become_hexahedra(tmp_path: Path) -> None:
     np.testing.assert_allclose(corners[:, 6] - corners[:, 0], 2.0)
 
 
+@pytest.mark.slow
 def test_the_split_is_the_published_one(tmp_path: Path) -> None:
     for k in range(1, 21):
         write(tmp_path / f"beam_{k}.pt", 0.1 * k)

@@ -56,6 +56,7 @@ def test_gradients_equal_finite_differences(guidance: Guidance) -> None:
         assert gradient[k] == pytest.approx(difference, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_the_search_stays_within_the_limits_and_gains(guidance: Guidance) -> None:
     found = search(guidance, SearchSettings(method="gradient", num_scanned=3, max_evaluations=5))
     assert found.misfit < guidance.misfit([0.5, 0.5, 0.5])

@@ -56,6 +56,7 @@ def test_logarithmic_parameters_are_found() -> None:
     assert answer.values[0].estimate == pytest.approx(0.03, rel=0.02)
 
 
+@pytest.mark.slow
 def test_bodies_have_values_of_their_own() -> None:
     values = np.repeat([24.0, 38.0], 9)
     answer = identify_parameters(Drag(), thrown(values), per_body=True, bounds=BOUNDS, search_settings=SearchSettings(max_evaluations=100))
@@ -63,6 +64,7 @@ def test_bodies_have_values_of_their_own() -> None:
     assert [value.truth for value in answer.values] == [24.0, 38.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wanted", [["sand", "velocity"], ["sand", "gravity"]])
 def test_motion_of_the_scene_is_found_too(wanted: list[str]) -> None:
     settings = SearchSettings(max_evaluations=150)
@@ -231,6 +233,7 @@ def leaves_and_start(simulator: LearnedSimulator, seen: Trajectory) -> tuple[lis
     return leaves, replace(start, material_params=1 * leaves[0], boundary=replace(start.boundary, pos=1 * leaves[1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_steps", [1, 5, 9])
 def test_scores_have_the_gradients_of_plain_rollouts(num_steps: int) -> None:
     """Also those of walls, which a step leaves as they are, with frames that have no score, and in several segments."""
@@ -251,6 +254,7 @@ def test_scores_have_the_gradients_of_plain_rollouts(num_steps: int) -> None:
         assert torch.allclose(one, other, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_scenes_of_a_batch_keep_their_gradients_where_one_fails() -> None:
     simulator, seen = learned()
     leaves, start = leaves_and_start(simulator, seen)
@@ -295,6 +299,7 @@ def test_the_check_refuses_gradients_of_the_wrong_sign_or_size() -> None:
         assert "cannot be trusted" in str(wrong)
 
 
+@pytest.mark.slow
 def test_a_search_without_trusted_gradients_goes_on_without(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator, seen = learned()
     trusted = gradient_check(gradients_of(simulator, seen), [0.7])
@@ -348,6 +353,7 @@ def test_a_profile_without_values_near_a_bound_reaches_it() -> None:
     assert Profile.of([(2.0, 1.0)], (0.0, 3.0)).within(0.1) == (0.0, 3.0)
 
 
+@pytest.mark.slow
 def test_calibrated_intervals_cover_and_follow_the_misfit() -> None:
     known, new = uneven(200, 0), uneven(1000, 1)
     found, truth = calibrated(known), np.array([own.truth for own in new])
@@ -428,6 +434,7 @@ def test_an_answer_of_another_version_is_refused(tmp_path: Path) -> None:
         read_answers(tmp_path, "solver")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("there", "name"),
     [({"unknowns": ["sand", "velocity"]}, "unknowns"), ({"bounds": {"sand.friction_angle": [10.0, 50.0]}}, "bounds"), ({"checkpoint": "x"}, "checkpoint")],
@@ -449,6 +456,7 @@ def test_a_calibration_of_another_search_is_refused(tmp_path: Path, there: dict[
         _calibrations(cfg, settings)
 
 
+@pytest.mark.slow
 def test_a_scene_that_is_too_short_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     model, seen = learned()
     seen = replace(seen, material_params=np.full_like(seen.material_params, 30.0))
@@ -462,6 +470,7 @@ def test_a_scene_that_is_too_short_is_left_out(tmp_path: Path, monkeypatch: pyte
         identify_all(task, [("brief", seen.frames(0, 1))], tmp_path)
 
 
+@pytest.mark.slow
 def test_a_folder_of_scenes_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model, seen = learned()
     seen = replace(seen, material_params=np.full_like(seen.material_params, 30.0))

@@ -69,6 +69,7 @@ def test_nodes_that_cross_a_seam_have_the_velocity_and_the_body_of_their_motion(
     assert sorted(map(len, scene_bodies(around))) == [9, 9]
 
 
+@pytest.mark.slow
 def test_bodies_are_those_of_the_first_observed_frame() -> None:
     seen = thrown(np.repeat([24.0, 38.0], 9))
     flags, hidden = np.ones(seen.pos.shape[:2], dtype=bool), seen.pos.copy()
@@ -116,6 +117,7 @@ class Valley:
         raise AssertionError
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [2, 3])
 def test_intervals_follow_valleys_of_the_misfit(number: int) -> None:
     """The smallest misfit over the other unknown rises by less than 0.1 over the whole range."""
