@@ -121,6 +121,9 @@ class Survey:
         if deformation > NOT_RIGID:
             what = f"distances in a rigid body change by {deformation:.3g} of its size; models keep them"
             self.suspects.append(Event(split, name, -1, what))
+        num_frames = FLIGHT_FRAMES if len(self.flights) < NUM_SAMPLED else FEW_FLIGHT_FRAMES
+        flight = Flight(split, name, loaded.assumes_gravity, free_flight_of(trajectory, facts, num_frames))  # the last that may refuse it
+        self.flights.append(flight)
         self.good.setdefault(split, []).append(item)
         self.recordings.add(item, part)
         self.contents[id(item)] = m, trajectory.stress is not None
@@ -144,8 +147,6 @@ class Survey:
         self.stressed |= set(m.with_stress if trajectory.stress is not None else ())
         self.num_bytes += sum(array.nbytes for array in arrays.values())
         self.bounds.append(m.bounds)
-        num_frames = FLIGHT_FRAMES if len(self.flights) < NUM_SAMPLED else FEW_FLIGHT_FRAMES
-        self.flights.append(Flight(split, name, loaded.assumes_gravity, free_flight_of(trajectory, facts, num_frames)))
         if len(self.spacings) < NUM_SAMPLED:
             self.spacings.append(m.spacing)
             self.radii.append(m.connectivity_radius)
