@@ -20,6 +20,7 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.files.names import data_name, run_name
     from gpe_pl.files.run_folder import without_orphans
     from gpe_pl.system.locks import locked
+    from gpe_pl.training.parallel import end_later_processes
 
     data_name(cfg.data.name, "data.name")
     if cfg.reuse is not None:
@@ -31,7 +32,9 @@ def fit(cfg: DictConfig) -> float:
         run.choose_num_steps()
         run.claim_folder()
         with without_orphans(folder):
-            if not run.is_evaluated:
+            if run.is_evaluated:
+                end_later_processes()  # they have nothing to report
+            else:
                 run.check_evaluation()
                 run.evaluate(run.finished_model() or run.train())
             return run.error()

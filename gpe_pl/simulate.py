@@ -53,7 +53,7 @@ def _choose_scenes(cfg: DictConfig) -> None:
     with written(cfg.paths.data, pool), progress_bar(f"{pool.name} {pool.size} candidates") as on_progress:
         choice = choose(cfg.paths.data, pool, cfg.data.num_train, settings, on_progress)
     if choice is None:
-        print(f"{pool.name} {pool.size}: has {cfg.data.num_train} training scenes; nothing to choose")
+        print(f"{pool.name} {pool.size}: has at least {cfg.data.num_train} training scenes; nothing to choose")
         return
     print(
         f"{pool.name} {pool.size}: chose scenes {', '.join(map(str, choice.scenes))}, in which the models are {min(choice.spread):.3g} to "

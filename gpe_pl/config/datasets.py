@@ -110,7 +110,7 @@ def _spec(cfg: DictConfig, **replaced: Any) -> DatasetSpec:
 
 def candidate_spec(cfg: DictConfig, num_candidates: int) -> DatasetSpec:
     """Return the data set with all candidates for a choice as its training scenes. Errors are those of ``dataset_spec``."""
-    return _spec(cfg, num_train=num_candidates)
+    return replace(_spec(cfg), num_train=num_candidates)
 
 
 def dataset(*overrides: str) -> DatasetSpec:

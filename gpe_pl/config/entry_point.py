@@ -12,6 +12,7 @@ import importlib
 import json
 import math
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -70,6 +71,8 @@ _results: list[Path] = []
 
 LARGEST_INTEGER = 2**63 - 1
 """Largest integer setting, a limit of NumPy and PyTorch."""
+PLAIN = re.compile(r"[A-Za-z0-9_/\\:\-+.$%*@?| ]*")
+"""Values that Hydra's grammar takes without quotes."""
 
 
 @dataclass(frozen=True)
@@ -247,10 +250,17 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
 
 def quoted(argument: str) -> str:
-    """Quote the value of an override if it is an existing path that contains ``=``, as folders of sweeps do. Hydra requires the quotes."""
+    """Quote the value of an override if it is a path with characters for which Hydra requires quotes: ``=``, as in folders of sweeps, or ``ü``.
+
+    A path exists, or its folder does and it has no comma, which would separate values of a sweep.
+    """
     key, _, value = argument.partition("=")
-    is_path = "=" in value and value[0] not in "\"'[{" and os.path.exists(value)  # Path.exists fails on names that are too long
-    return f'{key}="{value}"' if is_path else argument
+    if PLAIN.fullmatch(value) or value[0] in "\"'[{":
+        return argument
+    is_path = os.path.exists(value) or (
+        "," not in value and os.path.isdir(os.path.dirname(value))
+    )  # Path.exists fails on names that are too long
+    return '{}="{}"'.format(key, value.replace('"', '\\"')) if is_path else argument
 
 
 def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:

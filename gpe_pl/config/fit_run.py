@@ -46,7 +46,7 @@ from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_ti
 from gpe_pl.training.loss_terms import mean_num_neighbors
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.optimizer import train_only
-from gpe_pl.training.parallel import end_later_processes
+from gpe_pl.training.parallel import be_the_only_process, end_later_processes, started_processes
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, seed, set_up, train
 from gpe_pl.training.tracking import LoggerSettings, publish
 from gpe_pl.trajectory.store import iter_trajectories
@@ -83,6 +83,7 @@ class FitRun:
         if cfg.start_from is None and self.training.early_layers is not None:
             raise ConfigError(f"training.early_layers={self.training.early_layers}: the other layers stay as they are; needs start_from")
         self.trainer = construct(TrainerSettings, cfg.trainer, "trainer")
+        self._check_processes()
         self.evaluation = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
         check_splits(evaluated_config(cfg), self.evaluation.splits, "evaluation.splits")
         check_material_controls(cfg, self.evaluation)
@@ -99,6 +100,16 @@ class FitRun:
             )
         self.start = None if cfg.start_from is None else LearnedSimulator.from_checkpoint(cfg.start_from)
         self.callbacks: list[PauseForMeasurements] = []
+
+    def _check_processes(self) -> None:
+        count, started = self.trainer.num_processes, started_processes()
+        if count == 1:
+            be_the_only_process()
+        elif started not in (None, count):
+            raise ConfigError(
+                f"trainer.devices={self.trainer.devices}, trainer.num_nodes={self.trainer.num_nodes}: are {count} processes, and the launcher (torchrun or "
+                f"srun) started {started}; choose equal numbers, or leave the launcher out"
+            )
 
     def prepare_data(self) -> None:
         """Generate missing data and controls, after checking that noise and evaluation fit the scenes, and ``start_from`` the model. Choose the device.
@@ -173,6 +184,7 @@ class FitRun:
     def train(self) -> Path:
         """Train to the last step, starting from the last checkpoint if there is one, and return the best checkpoint."""
         if self.training.num_steps == 0:
+            end_later_processes()
             best = self.folder / "checkpoints" / "best.ckpt"
             best.parent.mkdir(parents=True, exist_ok=True)
             simulator = self._new_module(self.training).simulator

@@ -173,7 +173,8 @@ def choose(
         SealError: the file of earlier choices is damaged.
     """
     folder = Path(root) / pool.name / pool.size
-    choices = read(folder) or [Choice(known, [], 0, 0, [], 0.0) for known in [stored_scenes(root, pool)] if known]
+    stored = stored_scenes(root, pool)  # also checks that the folder holds this data set
+    choices = read(folder) or ([Choice(stored, [], 0, 0, [], 0.0)] if stored else [])
     known = [scene for choice in choices for scene in choice.scenes]
     if len(known) >= num_train:
         return None

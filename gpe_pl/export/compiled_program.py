@@ -41,10 +41,13 @@ def export_compiled(simulator: LearnedSimulator, path: Path | str, states: Seque
 
     Raises:
         CompiledProgramError: the compiled program moves a node elsewhere, by more than ``TOLERANCE``; nothing is written.
-        CellError, MirrorAverageError, RigidBodyError, ValueError: as ``export_model`` and ``scene_of`` raise them.
+        ValueError: ``path`` has another file type, or there are no states.
+        CellError, MirrorAverageError, LeastDistanceError, NodeLoadError, RigidBodyError, OpenSceneError: as ``export_model`` and ``scene_of`` raise them.
     """
     if Path(path).suffix != ".pt2":
         raise ValueError(f"{path}: a compiled program ends in .pt2")
+    if not states:
+        raise ValueError("states: give at least one, in which the compiled program is compared with the model")
     scenes = [scene_of(simulator, state) for state in states]
     with tempfile.TemporaryDirectory(prefix="gpe_") as folder, torch.no_grad():
         plain, compiled = Path(folder) / "plain.pt2", Path(folder) / "compiled.pt2"

@@ -180,6 +180,8 @@ def export_network(simulator: LearnedSimulator, path: Path | str, states: Sequen
     path = Path(path)
     if path.suffix != ".onnx":
         raise ValueError(f"{path}: an ONNX file ends in .onnx")
+    if not states:
+        raise ValueError("states: give at least one, in which the exported network is compared with the model")
     check_network(simulator)
     content = _program(simulator, _arguments(simulator, states[0]))
     found = difference(simulator, simulator_of(simulator, content), states)

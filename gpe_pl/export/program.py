@@ -1,7 +1,8 @@
 """Export of a trained model as a ``torch.export`` program that advances a scene by one frame. The program needs PyTorch but not this package.
 
 The program takes a scene as a dictionary of tensors. It returns the changed tensors and the predictions. The caller gives the topology of the graph: edges,
-and islands and virtual nodes if the model uses them. The program does everything else. In Python::
+and islands and virtual nodes if the model uses them. The program does everything else of a step. It does not contain: rollouts of this package move nodes that
+enter a wall or an obstacle out again (``rollout.containment``), and a caller of the program has to. In Python::
 
     program = torch.export.load("model.pt2").module()
     scene["edges.sand.radius.sand"] = …           pairs within the radius, each once; row 0 source, row 1 target

@@ -15,6 +15,7 @@ from gpe_pl.geometry.shapes import thickness
 from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.training_ranges import stored_ranges
+from gpe_pl.learned.unlike import UnlikeScenes, Watch, trained_limits
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import rollout
@@ -65,6 +66,8 @@ def guard_of(metadata: Metadata) -> Guard:
 def predicted(simulator: LearnedSimulator, state: State, metadata: Metadata, num_frames: int, label: str) -> Trajectory:
     """Roll a model out from a state without earlier frames; a progress bar shows rate and remaining time.
 
+    A warning is logged for speeds and accelerations far beyond those of the training.
+
     Args:
         simulator: the model.
         state: state of the scene, as NumPy arrays.
@@ -76,17 +79,21 @@ def predicted(simulator: LearnedSimulator, state: State, metadata: Metadata, num
         SceneError: the scene does not fit the model.
     """
     start = simulator.standing(state, metadata)
+    watch = Watch(simulator, num_frames)
+    watch.see(0, start)
     is_quick = num_frames * state.num_nodes <= QUICK and not has_compiled("nn/network_program_kernels.py")
     on_threads = one_thread() if state.num_nodes <= FEW else contextlib.nullcontext()
     with unfused() if is_quick else contextlib.nullcontext(), on_threads, progress_bar(label) as on_progress:
-        return rollout(
-            Contained(approximate(simulator), metadata.frame_dt),
-            start,
-            num_frames,
-            metadata,
-            guard_of(metadata),
-            lambda frame, _: on_progress(frame, num_frames),
-        )
+
+        def see(frame: int, now: State) -> None:
+            watch.see(frame, now)
+            on_progress(frame, num_frames)
+
+        found = rollout(Contained(approximate(simulator), metadata.frame_dt), start, num_frames, metadata, guard_of(metadata), see)
+    unlike = UnlikeScenes(trained_limits(simulator), "training", is_complete=False)
+    unlike.add(watch.found)
+    unlike.warn("this rollout")
+    return found
 
 
 def solved(solver: Any, state: State, metadata: Metadata, num_frames: int, label: str) -> Trajectory:

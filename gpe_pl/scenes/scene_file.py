@@ -45,6 +45,8 @@ class _Loader(yaml.SafeLoader):
         lines: dict[Any, int] = {}
         for key, _ in node.value:
             line = key.start_mark.line + 1
+            if not isinstance(key.value, str):
+                raise SceneFault({f"line {line}": "a key must be a word"})
             if lines.setdefault(key.value, line) != line:
                 raise SceneFault({str(key.value): f"occurs in line {lines[key.value]} and again in line {line}; put all into one"})
         return super().construct_mapping(node, deep)

@@ -8,12 +8,14 @@ N_r is the number of nodes on rank r. L is therefore the mean over all nodes of 
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterable
 from typing import ClassVar
 
 import torch
 import torch.distributed as dist
+from lightning.fabric.plugins.environments import SLURMEnvironment, TorchElasticEnvironment
 from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor, nn
@@ -33,6 +35,18 @@ def sum_gradients(parameters: Iterable[nn.Parameter]) -> None:
     is_there, *parts = message.split([len(parameters), *(p.numel() for p in parameters)])
     for parameter, part, number in zip(parameters, parts, is_there.tolist(), strict=True):
         parameter.grad = part.view_as(parameter) if number else None
+
+
+def started_processes() -> int | None:
+    """Return the number of processes that torchrun or Slurm's srun started with this one, or None if neither did."""
+    if TorchElasticEnvironment.detect():
+        return int(os.environ["WORLD_SIZE"])
+    return int(os.environ["SLURM_NTASKS"]) if SLURMEnvironment.detect() else None
+
+
+def be_the_only_process() -> None:
+    """Let this process log and continue after the training, also in a task of Slurm that is not the first: every task may be a run of its own."""
+    rank_zero_only.rank = 0  # type: ignore[attr-defined]
 
 
 def end_later_processes() -> None:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 import lightning as L
 import torch
-from lightning.fabric.plugins.environments import SLURMEnvironment
+from lightning.fabric.plugins.environments import ClusterEnvironment, LightningEnvironment, SLURMEnvironment
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
@@ -27,6 +27,7 @@ from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import PushForward, Sampling
 from gpe_pl.errors import GpeError
 from gpe_pl.errors.origin import came_through
+from gpe_pl.errors.printable import one_line
 from gpe_pl.files.atomic import replacing
 from gpe_pl.files.run_folder import CONFIG, RunError, config_in, differences
 from gpe_pl.learned.checkpoint_file import reason
@@ -270,7 +271,7 @@ def train(
         trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
     if checkpoints.best_step == 0:
         log.warning(
-            "start_from: every validation was clearly worse than the model at the start, so %s is that model; the trained one is %s. "
+            "start_from: every validation was clearly worse than the model at the start, so %s has its weights; those of the training are in %s. "
             "Try a lower training.learning_rate or more trajectories",
             checkpoints.best,
             checkpoints.last,
@@ -378,10 +379,19 @@ def _trainer(
             enable_progress_bar=False,
             enable_model_summary=False,
             default_root_dir=run_dir,
-            plugins=[AtomicCheckpoints(), *([SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else [])],
+            plugins=[AtomicCheckpoints(), *_environment(is_parallel)],
         )
-    except MisconfigurationException as error:
-        raise RunError(f"trainer.accelerator={trainer_settings.accelerator}, trainer.devices={trainer_settings.devices}: {error}") from None
+    except (MisconfigurationException, RuntimeError, ValueError) as error:  # Lightning raises all three for what a launcher did otherwise
+        raise RunError(
+            f"trainer.accelerator={trainer_settings.accelerator}, trainer.devices={trainer_settings.devices}: {one_line(str(error))}"
+        ) from None
+
+
+def _environment(is_parallel: bool) -> list[ClusterEnvironment]:
+    """Return how Lightning learns of other processes, if it is not by itself. A single process has none, also in a job of Slurm with several tasks."""
+    if not is_parallel:
+        return [LightningEnvironment()]
+    return [SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else []
 
 
 def seed(number: int) -> None:

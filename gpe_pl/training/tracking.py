@@ -27,6 +27,8 @@ WANDB_URL = "https://api.wandb.ai"
 FILMS: tuple[Literal["gif", "mp4"], ...] = ("gif", "mp4")
 TENSORBOARD = "tensorboard"
 """Name of the folder of TensorBoard's event files in a run's folder. A resumed run continues there."""
+MODES = ("online", "offline", "disabled", "dryrun", "run", "shared")
+"""Modes that W&B takes from ``WANDB_MODE``."""
 RUN_ID = "run_id"
 """Name of the file in a run's folder that holds the identifier of the run in W&B."""
 
@@ -45,6 +47,10 @@ class LoggerSettings:
     project: str = "gpe_pl"
     mode: Literal["online", "offline", "disabled"] | None = None
 
+    def __post_init__(self) -> None:
+        if self.kind == "wandb" and self.mode is None:
+            mode_of_environment()  # refuses a wrong one before data are generated
+
     def loggers(self, run_dir: Path, name: str, config: Mapping[str, Any]) -> list[Logger]:
         """Return loggers of a run: CSV under ``run_dir/log``, one version per start of the run, and W&B or TensorBoard if configured.
 
@@ -58,7 +64,7 @@ class LoggerSettings:
         """
         loggers: list[Logger] = [Log(run_dir, name="log", flush_logs_every_n_steps=1)]
         if self.kind == "wandb":
-            mode = self.mode or os.environ.get("WANDB_MODE") or ("online" if has_key() else "offline")
+            mode = self.mode or mode_of_environment() or ("online" if has_key() else "offline")
             loggers.append(self._wandb(run_dir, name, config, mode))
         if self.kind == "tensorboard":
             try:
@@ -76,7 +82,8 @@ class LoggerSettings:
 
         own = run_dir.parts[run_dir.parts.index(name) + 1 :] if name in run_dir.parts else ()  # within a sweep, this run's own part
         options: dict[str, Any] = {"group": name, "mode": mode, "resume": "allow"}
-        logger = WandbLogger("/".join(own) or name, save_dir=run_dir, project=self.project, id=run_id(run_dir), **options)
+        own_id = run_id(run_dir) if rank_zero_only.rank == 0 else None  # type: ignore[attr-defined]  # only the first process logs
+        logger = WandbLogger("/".join(own) or name, save_dir=run_dir, project=self.project, id=own_id, **options)
         try:
             logger.log_hyperparams({**config, "run_dir": str(run_dir)})
         except wandb.errors.Error as error:
@@ -126,6 +133,18 @@ def has_key() -> bool:
     except (OSError, netrc.NetrcParseError):
         return False
     return found is not None and bool(found[2])
+
+
+def mode_of_environment() -> str | None:
+    """Return the mode of W&B in ``WANDB_MODE``, or None if there is none.
+
+    Raises:
+        TrackingError: W&B has no such mode.
+    """
+    mode = os.environ.get("WANDB_MODE")
+    if mode and mode not in MODES:
+        raise TrackingError(f"WANDB_MODE={mode}: W&B has no such mode; it must be one of {', '.join(MODES)}")
+    return mode or None
 
 
 def run_id(run_dir: Path) -> str:

@@ -11,10 +11,15 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
+from gpe_pl.config.datasets import scene_metadata
+from gpe_pl.config.fit_run import FitRun
 from gpe_pl.config.folder import CONF
 from gpe_pl.evaluation.metric_rows import read_rows
 from gpe_pl.files.run_folder import without_tables
 from gpe_pl.fit import fit
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.transfer import start_from
 from tests.runs import compose, first_choices, tiny
 
 EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml"))
@@ -33,6 +38,8 @@ FEW_SHOT = ["start_from=null", "data.num_train=2", "data.num_frames=12", "evalua
 SCALES = ["data.num_train=2", "data.num_val=1", "data.num_test=1", "data.num_frames=40", "evaluation.horizons=[0.02]"]
 SHORT = {"stride": ["evaluation.start_time=0.025"], "scales": SCALES, "few_shot": FEW_SHOT, "few_shot_poisson": FEW_SHOT}
 """Overrides with which experiments fit miniature data."""
+STARTING = ["channel", "few_shot", "few_shot_poisson"]
+"""Experiments that start from a shipped model."""
 TAKING_OVER = [e for e in EXPERIMENTS if "\nreuse: table1\n" in (CONF / "experiment" / f"{e}.yaml").read_text()]
 
 
@@ -77,6 +84,23 @@ def test_every_value_of_a_sweep_is_a_run_of_its_own(experiment: str) -> None:
     kept = ("start_from", "data", "graph", "model", "training")
     done = [json.dumps({"on": run["evaluation"]["data"], **{key: run[key] for key in kept}}, sort_keys=True) for run in runs]
     assert len({*done}) == len(done)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", STARTING)
+def test_the_model_to_start_from_has_the_settings_of_the_experiment(experiment: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Tests with miniature data start from nothing, because a shipped model is too large for them."""
+    params: dict[str, Any] = compose("fit", f"experiment={experiment}", hydra_config=True).hydra.sweeper.params or {}
+    axes = [[f"{key}={value}" for value in str(values).split(",")] for key, values in params.items() if key != "seed"]
+    num_started = 0
+    for overrides in product(*axes):
+        cfg = compose("fit", f"experiment={experiment}", *overrides)
+        run = FitRun(cfg, CONF)
+        if run.start is not None:
+            builder = GraphBuilder(run.graph, scene_metadata(cfg, "train"))
+            start_from(LearnedSimulator(run.new_model(spec=builder.spec), builder, run.stride), run.start)
+            num_started += 1
+    assert num_started and "other graphs" not in caplog.text
 
 
 @pytest.mark.slow

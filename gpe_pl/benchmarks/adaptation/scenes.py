@@ -9,6 +9,7 @@ Values of the material parameter lie in the range that the model was trained on.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -80,6 +81,7 @@ def _liquid(candidate: Candidate, value: float, rng: np.random.Generator) -> Sta
 
 
 STARTS: dict[EngineName, Start] = {"kratos": _column, "calculix": _block, "splishsplash": _liquid}
+DIMENSIONS: dict[EngineName, int] = {"kratos": 2, "calculix": 2, "splishsplash": 3}
 
 
 def start(name: EngineName, candidate: Candidate, seed: int) -> State:
@@ -97,10 +99,11 @@ def pair(name: EngineName, candidate: Candidate, seed: int, folder: Path) -> Pai
     """
     scene, solver, state = SCENES[name], candidate.spec.solver, start(name, candidate, seed)
     count = candidate.simulator.builder.config.history + round(scene.seconds / solver.frame_dt)
-    motion = _kept(
-        folder / f"{digest_of(state.pos, state.vel, state.material_params, np.array(count))}.npz",
-        lambda: scene.run(candidate, state, count + 1),
-    )
+    settings = np.frombuffer(
+        json.dumps(candidate.spec.provenance, sort_keys=True).encode(), np.uint8
+    )  # engines read further constants from them
+    digest = digest_of(state.pos, state.vel, state.material_params, np.array(count), settings)
+    motion = _kept(folder / f"{digest}.npz", lambda: scene.run(candidate, state, count + 1))
     whole = rollout(solver, state, count, candidate.metadata())
     mean = np.concatenate([np.asarray(state.vel)[None], np.diff(motion.pos, axis=0) / solver.frame_dt])
     vel = mean if motion.vel is None else motion.vel

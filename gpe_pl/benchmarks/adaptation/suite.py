@@ -8,6 +8,7 @@ where it was.
 from __future__ import annotations
 
 import logging
+import shlex
 import shutil
 import subprocess
 import sys
@@ -21,7 +22,7 @@ import torch
 from pydantic import Field
 
 from gpe_pl.benchmarks.acceptance.trial import Candidate
-from gpe_pl.benchmarks.adaptation.scenes import Pair, digest_of, pair
+from gpe_pl.benchmarks.adaptation.scenes import DIMENSIONS, Pair, digest_of, pair
 from gpe_pl.benchmarks.learning_sets.measures import MODEL, lasting, rms_distance
 from gpe_pl.benchmarks.outside.engine import EngineError
 from gpe_pl.benchmarks.outside.engines import SCENES, EngineName
@@ -50,7 +51,7 @@ HEADER = ["engine", "simulator", "RMS distance to the engine [spacings]", "over 
 
 
 class AdaptationError(GpeError, RuntimeError):
-    """Raised when a training fails; the message has its command."""
+    """Raised when a training fails, with its command, and for a model of another material than the engine's scenes."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def run(settings: Settings, specs: Mapping[str, DatasetSpec], folder: Path) -> t
 
     Raises:
         OutsideError: a checkpoint was trained on none of ``specs``.
-        AdaptationError: a training failed, or an engine gives up too many scenes.
+        AdaptationError: a training failed, an engine gives up too many scenes, or a checkpoint was trained on other materials or in another dimension.
     """
     torch.set_num_threads(settings.num_threads)
     records, missing = list[dict[str, Any]](), list[tuple[str, str]]()
@@ -111,6 +112,12 @@ def run(settings: Settings, specs: Mapping[str, DatasetSpec], folder: Path) -> t
 
 
 def _of_engine(name: EngineName, own: OfEngine, candidate: Candidate, settings: Settings, folder: Path) -> list[dict[str, Any]]:
+    has, needs = (candidate.spec.scene.materials, len(candidate.spec.scene.bounds)), ((SCENES[name].material,), DIMENSIONS[name])
+    if has != needs:
+        (materials, dim), (only, needed) = has, needs
+        raise AdaptationError(
+            f"{name}: its scenes are of {only[0]} in {needed}D, and {own.checkpoint} was trained on {', '.join(materials)} in {dim}D; name another checkpoint"
+        )
     pairs, num_given_up = _made(name, candidate, settings, folder)
     dataset, tests = _stored(name, pairs, settings, folder), pairs[-settings.num_test :]
     start = candidate.simulator.builder.config.history
@@ -196,7 +203,7 @@ def _trained(dataset: str, own: OfEngine, who: str, seed: int, settings: Setting
     overrides += [f"start_from={own.checkpoint}"] if who == ADAPTED else []
     paths = [f"paths.data={folder / 'data'}", f"paths.runs={folder / 'runs'}"]
     if subprocess.run([sys.executable, "-m", "gpe_pl.fit", *overrides, *paths], check=False).returncode:
-        raise AdaptationError(f"python -m gpe_pl.fit {' '.join(overrides)}: failed; its messages are above")
+        raise AdaptationError(f"python -m gpe_pl.fit {shlex.join([*overrides, *paths])}: failed; its messages are above")
     return folder / "runs" / run_name / "checkpoints" / "best.ckpt"
 
 
@@ -223,7 +230,8 @@ def report(records: Sequence[Mapping[str, Any]], missing: Sequence[tuple[str, st
 NOTE = (
     "Whole rollouts on the engine's test scenes: RMS distance over frames, nodes and scenes, with its 95 % bootstrap interval over scenes and seeds, and the "
     "ratio on the same scenes. Stopped: number of rollouts that a guard ended; their nodes stay where they were. Models start from some frames of the engine, "
-    "the solver from its initial state. Adapted and from scratch have the same trajectories and steps, and learning rates of their own."
+    "the solver from its initial state. Adapted and from scratch have the same trajectories and steps, and learning rates of their own. "
+    "Only the shipped model has static friction, if it was shipped with it."
 )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -155,7 +156,7 @@ def _trained(name: SetName, label: str, dataset: str, seed: int, folder: Path, s
     about = ["data=imported", f"data.name={dataset}", f"name={run_name}", f"seed={seed}", shared, *overrides]
     paths = [f"paths.data={folder / 'data'}", f"paths.runs={folder / 'runs'}"]
     if subprocess.run([sys.executable, "-m", "gpe_pl.fit", *about, *paths], check=False).returncode:
-        raise LearningSetError(f"python -m gpe_pl.fit {' '.join(about)}: failed; its messages are above")
+        raise LearningSetError(f"python -m gpe_pl.fit {shlex.join([*about, *paths])}: failed; its messages are above")
     checkpoint = folder / "runs" / run_name / "checkpoints" / "best.ckpt"
     digest = sha256(checkpoint.read_bytes()).hexdigest()
     stored = folder / "runs" / run_name / MEASURED_FILE

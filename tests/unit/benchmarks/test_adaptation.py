@@ -80,6 +80,29 @@ def test_a_stopped_command_does_not_run_the_engine_again(
     assert again.solver.shape == engine.pos.shape and not np.array_equal(again.solver, engine.pos)
 
 
+@pytest.mark.slow
+def test_an_engine_runs_again_for_other_constants_of_the_solver(
+    tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Poisson's ratio is not in the state."""
+    run, calls = engine_that_slides(0.1)
+    with_engine(monkeypatch, "calculix", run)
+    other = replace(candidates["calculix"], spec=dataset("data=fem", "size=small", "data.solver.poisson_ratio=0.45"))
+    for candidate in (candidates["calculix"], other, other):
+        scenes.pair("calculix", candidate, 0, tmp_path)
+    assert len(calls) == 2
+
+
+@pytest.mark.slow
+def test_a_model_of_another_material_is_refused(tmp_path: Path, candidates: dict[EngineName, Candidate]) -> None:
+    wrong: list[tuple[EngineName, str]] = [("kratos", "fluid"), ("kratos", "fem"), ("calculix", "sand"), ("splishsplash", "sand")]
+    for engine, other in wrong:
+        (candidate,) = (c for name, c in candidates.items() if ENGINES[name] == other)
+        with pytest.raises(suite.AdaptationError, match=f"{engine}: its scenes are of .* and {other} was trained on"):
+            suite._of_engine(engine, suite.OfEngine(other, []), candidate, settings(), tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
 def test_velocities_and_stress_of_an_engine_are_stored_with_its_scenes(
     tmp_path: Path, candidates: dict[EngineName, Candidate], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -187,7 +210,10 @@ def test_a_failed_training_is_named_with_its_command(
     with_engine(monkeypatch, "kratos", run)
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
     monkeypatch.setattr(suite, "measured", lambda *_: {"model": [1e-3, 2e-3]})
-    with pytest.raises(suite.AdaptationError, match=r"gpe_pl.fit data=imported data.name=kratos_[0-9a-f]{16} .* start_from=sand: failed"):
+    with pytest.raises(
+        suite.AdaptationError,
+        match=r"gpe_pl.fit data=imported data.name=kratos_[0-9a-f]{16} .* start_from=sand paths.data=.* paths.runs=.*: failed",
+    ):
         suite.run(settings(), {"sand": candidates["kratos"].spec}, tmp_path)
 
 

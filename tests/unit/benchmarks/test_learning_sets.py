@@ -157,7 +157,8 @@ def test_every_split_is_trained_and_measured_once(
 def test_a_training_that_fails_names_its_command(tmp_path: Path, falls: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1))
     with pytest.raises(
-        suite.LearningSetError, match=r"name=fluidfall_without_0_seed_0 seed=0 reuse=fluidfall_without_0 training.budget_minutes=10: failed"
+        suite.LearningSetError,
+        match=r"name=fluidfall_without_0_seed_0 seed=0 reuse=fluidfall_without_0 training.budget_minutes=10 paths.data=.* paths.runs=.*: failed",
     ):
         suite.run(suite.Settings(str(falls), only=["fluidfall"], num_splits=1), tmp_path / "runs")
 

@@ -433,10 +433,16 @@ def test_commands_fail_in_one_line(tmp_path: Path, command: str, arguments: list
     assert "Traceback" not in child.stdout + child.stderr
 
 
-def test_a_path_with_an_equals_sign_is_taken_as_typed(tmp_path: Path) -> None:
+def test_a_path_is_taken_as_typed(tmp_path: Path) -> None:
     run = tmp_path / "data=sand" / "seed=0"
     run.mkdir(parents=True)
     assert compose("evaluate", quoted(f"checkpoint={run}")).checkpoint == str(run)
+    for name in ("müller", "a (1)", "a,b", 'inches"', "a#b", "näch'ste"):
+        (tmp_path / name).mkdir()
+        assert compose("evaluate", quoted(f"checkpoint={tmp_path / name}")).checkpoint == str(tmp_path / name)
+        if "," not in name:  # a folder that is still to be made
+            new = str(tmp_path / name / "new=1")
+            assert compose("evaluate", quoted(f"checkpoint={new}")).checkpoint == new
     for argument in (
         f"checkpoint={tmp_path}",
         "checkpoint=",
@@ -445,6 +451,10 @@ def test_a_path_with_an_equals_sign_is_taken_as_typed(tmp_path: Path) -> None:
         "--help",
         "a=b=c",
         "a=" + 200 * "b=c",
+        "a=range(1,3)",
+        "model.hidden_channels=8,16",
+        f"paths.runs={tmp_path}/x=1,{tmp_path}/x=2",
+        "a=${paths.runs}/x",
     ):
         assert quoted(argument) == argument
     assert "a value that holds = needs quotes: 'KEY=\"VALUE\"'" in complaint("evaluate", f"checkpoint={run}0")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,14 @@ import torch
 from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.data import chosen_scenes
+from gpe_pl.data.chosen_scenes import SPEC_FILE
+from gpe_pl.data.generation import GenerationError
 from gpe_pl.data.ground_truth import DatasetSpec, trajectory_metadata
 from gpe_pl.data.validate import validate
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation import active
 from gpe_pl.evaluation.active import ActiveSettings, choose, disagreement, drawn
+from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.ensemble import LearnedEnsemble
@@ -86,11 +90,16 @@ def test_a_draw_has_no_scene_twice_and_takes_zeros_last() -> None:
 def test_a_choice_is_noted_and_made_once(tmp_path: Path, models: list[str]) -> None:
     folder, settings = tmp_path / "sand" / "tiny", ActiveSettings(models, horizon=0.015)
     chosen_scenes.write(folder, [chosen_scenes.Choice([0, 1], [], 0, 0, [], 0.0)])
+    spec = pool().as_dict()
+    (folder / SPEC_FILE).write_text(json.dumps({"spec": spec, "sha256": sealed.checksum(spec)}))
     choice = choose(tmp_path, pool(), 4, settings)
     assert choice is not None and chosen_scenes.read(folder)[1] == choice
     assert len({*choice.scenes}) == 2 and {*choice.scenes} <= {2, 3, 4, 5}
     assert (choice.num_candidates, choice.num_frames, len(choice.models)) == (6, 3, 2)
     assert choose(tmp_path, pool(), 4, settings) is None
+    with pytest.raises(GenerationError, match="holds a data set with other settings: seed is 0, now 7"):
+        choose(tmp_path, pool("data.seed=7"), 5, settings)
+    assert len(chosen_scenes.read(folder)) == 2
     more = choose(tmp_path, pool(), 5, settings)
     assert more is not None and not {*more.scenes} & {0, 1, *choice.scenes}
 
@@ -136,5 +145,7 @@ def test_the_command_chooses_and_simulates(tmp_path: Path, models: list[str], ca
     assert not validate([folder]).violations and len([*iter_trajectories(folder, "train")]) == 4
     assert "nothing to choose" in run(*growing) and len(chosen_scenes.read(folder)) == 2
     run("data.num_train=4")  # as `fit` does
+    with pytest.raises(ConfigError, match="data.num_train='abc'|data.num_train=abc"):
+        run(*growing, "data.num_train=abc")
     with pytest.raises(ConfigError, match="choose scenes with num_parts=1"):
         run(*growing, "num_parts=2")

@@ -200,6 +200,7 @@ def test_a_file_is_the_same_scene(tmp_path: Path) -> None:
             "obstacles:\n  - {circle: [0.2, 0.8], radius: 0.1}\nobstacles:",
             "obstacles: occurs in line 6 and again in line 8; put all into one",
         ),
+        ("box: [1.0, 1.0]", "box: [1.0, 1.0]\n? [a, b]\n: 4", "line 3: a key must be a word"),
         ("box: [1.0, 1.0]", "box: [1.0, 1.0]\nseed: abc", "seed: must be a whole number of at least 0, got 'abc'"),
     ],
 )
@@ -220,6 +221,16 @@ def test_numbers_have_exponents_with_and_without_a_point(tmp_path: Path, value: 
 def test_a_title_is_text(tmp_path: Path, title: str) -> None:
     (tmp_path / "scene.yaml").write_text(f"title: {title}\n{FILE}")
     assert isinstance(read_scene(tmp_path / "scene.yaml").title, str)
+
+
+@pytest.mark.slow
+def test_a_speed_far_beyond_the_training_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    """Such as a velocity in mm/s. The scene that the model knows gets no warning."""
+    scene = Scene(box=(1.0, 1.0))
+    scene.block("sand", at=(0.1, 0.1), size=(0.2, 0.2)).predict("sand", seconds=0.02)
+    assert not [r for r in caplog.records if "unlike" in r.message]
+    scene.block("sand", at=(0.1, 0.1), size=(0.2, 0.2), velocity=(500.0, 0.0)).predict("sand", seconds=0.02)
+    assert "unlike training in this rollout: speed of sand [m/s] is up to 500, in training at most" in caplog.text
 
 
 @pytest.mark.slow

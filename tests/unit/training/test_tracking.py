@@ -13,11 +13,12 @@ import pytest
 import wandb
 from lightning.pytorch import loggers as lightning_loggers
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities import rank_zero_only
 from PIL import Image
 
 from gpe_pl.files.atomic import FullDiskError
 from gpe_pl.training import tracking
-from gpe_pl.training.tracking import LoggerSettings, TrackingError, publish, run_id
+from gpe_pl.training.tracking import RUN_ID, LoggerSettings, TrackingError, publish, run_id
 
 
 class Recorder(Logger):
@@ -62,6 +63,19 @@ def test_the_setting_goes_before_the_environment(
         monkeypatch.setenv("WANDB_MODE", environment)
     LoggerSettings("wandb", mode=setting).loggers(tmp_path, "run", {})
     assert Recorder.modes == [mode]
+
+
+def test_a_mode_that_wandb_does_not_have_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WANDB_MODE", "of")
+    with pytest.raises(TrackingError, match="WANDB_MODE=of: W&B has no such mode; it must be one of online, offline, disabled"):
+        LoggerSettings("wandb")
+    assert LoggerSettings("wandb", mode="offline").mode == "offline" and LoggerSettings("csv").mode is None
+
+
+def test_only_the_first_process_makes_an_identifier(tmp_path: Path, recorder: type[Recorder], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rank_zero_only, "rank", 1)
+    LoggerSettings("wandb", mode="offline").loggers(tmp_path, "name", {})
+    assert not (tmp_path / RUN_ID).exists()
 
 
 def test_without_a_network_a_run_is_kept_offline(tmp_path: Path, recorder: type[Recorder], caplog: pytest.LogCaptureFixture) -> None:

@@ -98,7 +98,9 @@ def test_the_same_scene_in_another_precision_is_there_twice(tmp_path: Path) -> N
 
 
 def test_a_wall_along_an_axis_that_data_lack_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ImportFailure, match=r"no training trajectory can be used: train, 0\.npz: has 2 axes, so there is no wall z_low; walls are"):
+    with pytest.raises(
+        ImportFailure, match=r"no training trajectory can be used: train, 0\.npz: has 2 axes, so there is no wall z_low; walls are"
+    ):
         report(tmp_path, [flying(0), flying(1), flying(2)], walls={"z_low": 0.5})
 
 
