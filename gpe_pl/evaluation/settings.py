@@ -5,12 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from gpe_pl.errors import GpeError
 from gpe_pl.schema import Split
 
 Export = Literal["vtk", "npz", "mp4", "svg", "pdf", "model", "onnx", "page"]
+
+
+def _different(splits: list[Split]) -> list[Split]:
+    """Raise an error for a split that is given twice. Its scenes would count twice, and confidence intervals would be too narrow."""
+    if twice := [split for split in dict.fromkeys(splits) if splits.count(split) > 1]:
+        raise ValueError(f"must have each split once, {twice[0]} occurs {splits.count(twice[0])} times")
+    return splits
 
 
 class StartError(GpeError, ValueError):
@@ -42,7 +49,7 @@ class EvaluationSettings:
             browser (see ``export.play_page``), with films of these trajectories.
     """
 
-    splits: Annotated[list[Split], Field(min_length=1)] = field(default_factory=lambda: ["test", "test_unseen"])
+    splits: Annotated[list[Split], Field(min_length=1), AfterValidator(_different)] = field(default_factory=lambda: ["test", "test_unseen"])
     horizons: list[Annotated[float, Field(gt=0)]] = field(default_factory=lambda: [0.025, 0.1, 0.25, 0.5])
     num_trajectories: Annotated[int, Field(ge=1)] | None = None
     start_time: Annotated[float, Field(ge=0)] | None = None

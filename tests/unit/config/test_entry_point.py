@@ -222,6 +222,7 @@ def test_a_misspelling_beside_a_sweep_gets_the_valid_ones() -> None:
         ),
         ("evaluation.splits=[tset]", "evaluation.splits.0='tset': must be 'train', 'val', 'test' or 'test_unseen'"),
         ("evaluation.splits=[]", r"evaluation.splits=\[\]: must have at least 1 values"),
+        ("evaluation.splits=[val,test,val]", "evaluation.splits=.*must have each split once, val occurs 2 times"),
         ("seed=-1", "seed=-1: must be an integer of at least 0"),
         ("seed=first", "seed='first': must be an integer of at least 0"),
         ("logger.kind=tb", "logger.kind='tb': must be 'csv', 'wandb' or 'tensorboard'"),
