@@ -29,7 +29,7 @@ SOFT, STIFF = 1e6, 4e6
 FRAMES, STEPS = 4, 300
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_constants_are_recovered_at_two_moduli() -> None:
     """Bodies that were strained by 2 % swing freely. Training begins at constants that are wrong by factors of up to 20."""
     spec = dataset("data=fem", "size=tiny", "data.num_frames=4", "data.scene.num_cells=60")

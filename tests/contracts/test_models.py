@@ -45,13 +45,12 @@ MODELS: dict[str, Factory] = {
 USUAL = {
     "gpe-directed-node-latent", "gpe-negated-node-latent", "gpe-odd-pair-geometry", "gpe-odd_even-node-geometry", "gpe-angular", "gns", "dpinet", "cconv",
 }  # fmt: skip
-"""Combinations that cover every setting and every model once; the slow tests run all combinations."""
+"""Combinations that cover every setting and every model once; the long tests run all combinations."""
 ON_MESHES = ("gpe-negated-node-latent", "gpe-odd-pair-geometry", "gpe-angular", "gns", "dpinet")
 MAY_BE_UNUSED = ("updates", "lin_even", "pair_decoder", "boundary")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in USUAL else pytest.mark.slow) for name in MODELS])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in USUAL else pytest.mark.long) for name in MODELS])
 @pytest.mark.parametrize("check", CHECKS)
 def test_contract(check: str, name: str) -> None:
     if CHECKS[check] is check_every_parameter_is_used:

@@ -28,7 +28,6 @@ QUICK = {"smoke"}
 SLOW = {
     "ablation_momentum",
     "ladder",
-    "mixed_materials",
     "table1",
     "table1_equal_steps",
     "unseen_materials",
@@ -72,7 +71,7 @@ def test_an_experiment_trains_and_evaluates(experiment: str, tiny_data: Path, tm
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize("experiment", [pytest.param(e, marks=pytest.mark.long if e.startswith("tuning") else ()) for e in EXPERIMENTS])
 def test_every_value_of_a_sweep_is_a_run_of_its_own(experiment: str) -> None:
     """An axis that changes nothing for some model would train the same thing twice and show it as two."""
     params: dict[str, Any] = compose("fit", f"experiment={experiment}", hydra_config=True).hydra.sweeper.params or {}

@@ -29,7 +29,7 @@ def run(*command: str) -> None:
     assert child.returncode == 0, child.stdout + child.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not (shutil.which("cmake") and shutil.which("g++")), reason="needs cmake and g++")
 def test_the_example_moves_particles_as_python_does(tmp_path: Path) -> None:
     spec = importlib.util.spec_from_file_location("prepare", EXAMPLE / "prepare.py")

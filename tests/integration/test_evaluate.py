@@ -318,7 +318,7 @@ def test_only_the_split_that_is_asked_for_is_generated(tiny_data: Path, tmp_path
     assert {path.parent.name for path in folder.glob("*/shard-*.h5")} == {"train", "test_unseen"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_canyon_is_compared_with_the_solver_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec = dataset_spec(compose("simulate", *DATA, "data=fluid"))
     builder = GraphBuilder(GraphConfig(history=2), trajectory_metadata(spec, "train", 0))

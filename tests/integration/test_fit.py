@@ -85,10 +85,10 @@ def checkpoint(cfg: DictConfig, name: str = "last") -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("killed_at", "saved", "late"),
     [
-        pytest.param(1, 0, PLAIN, marks=pytest.mark.slow),
-        pytest.param(5, 4, LATE, marks=pytest.mark.slow),
-        pytest.param(5, 4, PLAIN, marks=pytest.mark.slow),
-        pytest.param(3, 2, UNROLLED, marks=pytest.mark.slow),
+        pytest.param(1, 0, PLAIN, marks=pytest.mark.long),
+        (5, 4, LATE),
+        pytest.param(5, 4, PLAIN, marks=pytest.mark.long),
+        (3, 2, UNROLLED),
         (5, 5, (*LATE, "trainer.checkpoint_minutes=1e-9")),  # between validations
     ],
 )
@@ -407,7 +407,7 @@ def test_metrics_hold_the_model_and_the_baselines(tiny_data: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("targets", ["trajectory", "solver"])
+@pytest.mark.parametrize("targets", [pytest.param("trajectory", marks=pytest.mark.long), "solver"])
 def test_a_model_of_every_second_frame_is_compared_at_the_same_times(tiny_data: Path, tmp_path: Path, targets: str) -> None:
     elastomer = [] if targets == "trajectory" else ["data=elastomer"]
     shared = [

@@ -53,14 +53,9 @@ def test_a_wrong_configuration_is_said_once(tiny_data: Path, tmp_path: Path) -> 
     assert "training.learning_rate=-1" in result.stderr and "greater than 0" in result.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
-    ("launcher", "settings"),
-    [
-        ("processes", []),
-        pytest.param("slurm", ["hydra.launcher.cluster=local"], marks=pytest.mark.long),
-        pytest.param("ray", ["hydra.launcher.num_cpus=1"], marks=pytest.mark.long),
-    ],
+    ("launcher", "settings"), [("processes", []), ("slurm", ["hydra.launcher.cluster=local"]), ("ray", ["hydra.launcher.num_cpus=1"])]
 )
 def test_parts_of_a_data_set_are_generated_by_any_launcher(tiny_data: Path, tmp_path: Path, launcher: str, settings: list[str]) -> None:
     if launcher != "processes":

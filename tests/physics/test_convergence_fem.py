@@ -39,7 +39,7 @@ def frequency_of_thick_beam(plane_strain):
     ("kind", "tolerances"),
     [
         ("triangle", {2: 0.25, 4: 0.08, 8: 0.025}),
-        ("quad", {2: 0.08, 4: 0.03, 8: 0.015}),
+        pytest.param("quad", {2: 0.08, 4: 0.03, 8: 0.015}, marks=pytest.mark.long),
         ("tetrahedron", {1: 0.9, 2: 0.35, 4: 0.1}),
     ],
     ids=["triangle", "quad", "tetrahedron"],

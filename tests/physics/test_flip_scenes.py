@@ -161,7 +161,7 @@ def caps(radius, spacing, count):
     ("size", "cells", "count", "limits"),
     [
         ("tiny", 10, 500, (0.03, 0.15)),
-        ("small", 12, 1200, (0.02, 0.08)),
+        pytest.param("small", 12, 1200, (0.02, 0.08), marks=pytest.mark.long),
         pytest.param("paper", 18, 4000, (0.02, 0.02), marks=pytest.mark.long),
     ],
 )

@@ -334,6 +334,7 @@ def deposit(xi):
     return float(np.quantile(after.pos[:, 1], 0.95))
 
 
+@pytest.mark.long
 def test_snow_deposit_rises_with_hardening(physics):
     heights = {xi: deposit(xi) for xi in (3.0, 7.0, 10.0, 20.0)}
     for (lower, low), (higher, high) in itertools.pairwise(heights.items()):

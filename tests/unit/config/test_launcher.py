@@ -60,7 +60,7 @@ LAUNCHERS = {
 }
 
 
-@pytest.mark.parametrize("name", ["processes", pytest.param("slurm", marks=pytest.mark.slow), pytest.param("ray", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["processes", pytest.param("slurm", marks=pytest.mark.slow), pytest.param("ray", marks=pytest.mark.long)])
 def test_a_job_is_its_command_wherever_it_runs(folder: Path, name: str) -> None:
     if name != "processes":
         pytest.importorskip({"slurm": "submitit"}.get(name, name))

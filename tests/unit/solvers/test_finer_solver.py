@@ -129,7 +129,7 @@ def test_stress_of_a_cell_is_the_mean_of_its_parts() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["sand", "elastomer", "fem"])
+@pytest.mark.parametrize("name", ["sand", *(pytest.param(name, marks=pytest.mark.long) for name in ("elastomer", "fem"))])
 def test_tracers_are_nearer_to_a_solution_finer_still(name: str) -> None:
     """Until 0.15 s, on average over nodes and four scenes."""
     spec = spec_of(name, 2)

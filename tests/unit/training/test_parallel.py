@@ -193,7 +193,7 @@ SLOW = pytest.mark.slow
     ("size", "late"),
     [
         pytest.param(BatchSize(3), False, marks=pytest.mark.long),
-        pytest.param(BatchSize(3, max_nodes=64), False, marks=SLOW),
+        pytest.param(BatchSize(3, max_nodes=64), False, marks=pytest.mark.long),
         pytest.param(BatchSize(3), True, marks=pytest.mark.long, id="push-forward"),
         pytest.param(BatchSize(3, max_nodes=64), True, marks=SLOW, id="push-forward by nodes"),
     ],

@@ -158,7 +158,7 @@ POWERS = [(20, -12), (-20, 0), (0, 12), (-7, -12), (13, 5)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("length", "time"), POWERS)
+@pytest.mark.parametrize(("length", "time"), [*POWERS[:2], *(pytest.param(*power, marks=pytest.mark.long) for power in POWERS[2:])])
 def test_powers_of_two_change_nothing_but_the_units(length: int, time: int, tmp_path: Path, folder: Path) -> None:
     losses, step, rows = in_metres(folder)
     own_losses, own_step, own_rows = trained(folder, tmp_path, 2.0**length, 2.0**time)

@@ -425,8 +425,8 @@ SMALL = {"cantilever": {"cells": (8, 2, 2), "num_frames": 40}, "plate": {"cells"
 
 
 @needs_ccx
-@pytest.mark.slow
-@pytest.mark.parametrize("case", ["cantilever", pytest.param("plate", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("case", SMALL)
 def test_a_short_training_answers_what_calculix_does(tmp_path: Path, case: str) -> None:
     """Deflection within 10 % and peak stress within 25 % of their largest values in the mean over time, in a scene with an unseen modulus and load."""
     made = decks()
