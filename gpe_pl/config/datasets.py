@@ -91,7 +91,7 @@ def dataset_folder(cfg: DictConfig) -> Path:
     return Path(cfg.paths.data) / str(cfg.data.name) / str(cfg.size.name)
 
 
-def _spec(cfg: DictConfig, **replaced: Any) -> DatasetSpec:
+def _spec(cfg: DictConfig) -> DatasetSpec:
     from omegaconf import OmegaConf
 
     from gpe_pl.data.ground_truth import DatasetSpec
@@ -105,7 +105,7 @@ def _spec(cfg: DictConfig, **replaced: Any) -> DatasetSpec:
         values.pop(key, None)
     scene = construct_target(values.pop("scene"), "data.scene", "gpe_pl.solvers.")
     solver = construct_target(values.pop("solver"), "data.solver", "gpe_pl.solvers.")
-    return construct(DatasetSpec, {**values, **replaced}, "data", scene=scene, solver=solver)
+    return construct(DatasetSpec, values, "data", scene=scene, solver=solver)
 
 
 def candidate_spec(cfg: DictConfig, num_candidates: int) -> DatasetSpec:

@@ -257,9 +257,8 @@ def quoted(argument: str) -> str:
     key, _, value = argument.partition("=")
     if PLAIN.fullmatch(value) or value[0] in "\"'[{":
         return argument
-    is_path = os.path.exists(value) or (
-        "," not in value and os.path.isdir(os.path.dirname(value))
-    )  # Path.exists fails on names that are too long
+    # Path.exists fails on names that are too long
+    is_path = os.path.exists(value) or ("," not in value and os.path.isdir(os.path.dirname(value)))
     return '{}="{}"'.format(key, value.replace('"', '\\"')) if is_path else argument
 
 

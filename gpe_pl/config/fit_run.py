@@ -107,8 +107,8 @@ class FitRun:
             be_the_only_process()
         elif started not in (None, count):
             raise ConfigError(
-                f"trainer.devices={self.trainer.devices}, trainer.num_nodes={self.trainer.num_nodes}: are {count} processes, and the launcher (torchrun or "
-                f"srun) started {started}; choose equal numbers, or leave the launcher out"
+                f"trainer.devices={self.trainer.devices}, trainer.num_nodes={self.trainer.num_nodes}: are {count} processes, and torchrun or Slurm started "
+                f"{started}; choose equal numbers, or leave torchrun out and unset SLURM_NTASKS, so that this command starts the others"
             )
 
     def prepare_data(self) -> None:

@@ -99,10 +99,8 @@ def pair(name: EngineName, candidate: Candidate, seed: int, folder: Path) -> Pai
     """
     scene, solver, state = SCENES[name], candidate.spec.solver, start(name, candidate, seed)
     count = candidate.simulator.builder.config.history + round(scene.seconds / solver.frame_dt)
-    settings = np.frombuffer(
-        json.dumps(candidate.spec.provenance, sort_keys=True).encode(), np.uint8
-    )  # engines read further constants from them
-    digest = digest_of(state.pos, state.vel, state.material_params, np.array(count), settings)
+    settings = json.dumps(candidate.spec.provenance, sort_keys=True).encode()  # engines read further constants from them
+    digest = digest_of(state.pos, state.vel, state.material_params, np.array(count), np.frombuffer(settings, np.uint8))
     motion = _kept(folder / f"{digest}.npz", lambda: scene.run(candidate, state, count + 1))
     whole = rollout(solver, state, count, candidate.metadata())
     mean = np.concatenate([np.asarray(state.vel)[None], np.diff(motion.pos, axis=0) / solver.frame_dt])

@@ -45,6 +45,6 @@ def test_a_launcher_that_started_another_number_of_processes_is_named(
     for name, value in launched.items():
         monkeypatch.setenv(name, value)
     with pytest.raises(
-        ConfigError, match=r"trainer.devices=2, trainer.num_nodes=1: are 2 processes, and the launcher .* started [14]; choose"
+        ConfigError, match=r"trainer.devices=2, trainer.num_nodes=1: are 2 processes, and torchrun or Slurm started [14]; choose"
     ):
         FitRun(tiny(tiny_data, tmp_path, "trainer.devices=2"), tmp_path)
