@@ -53,7 +53,7 @@ def test_the_recipe_wins_over_an_experiment(experiment: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize("experiment", [pytest.param(e, marks=pytest.mark.long if e.startswith("tuning") else ()) for e in EXPERIMENTS])
 def test_the_recipe_wins_for_every_model_and_data_set(experiment: str) -> None:
     for overrides in swept(experiment):
         assert_is_the_papers(compose("fit", "recipe=paper", f"experiment={experiment}", "size=paper", *overrides))

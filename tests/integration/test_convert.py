@@ -137,7 +137,7 @@ def test_what_cannot_be_evaluated_is_said_before_the_training(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["gpe_tuned", "gns", "cconv", "dpinet"])
+@pytest.mark.parametrize("model", ["gpe_tuned", "gns", *(pytest.param(model, marks=pytest.mark.long) for model in ("cconv", "dpinet"))])
 def test_other_models_train_on_periodic_data(tmp_path: Path, lagrangebench: Path, model: str) -> None:
     convert(compose("convert", "format=lagrangebench", f"source={lagrangebench}", "name=tgv", f"paths.data={tmp_path / 'data'}"))
     trained(tmp_path, "tgv", f"model={model}")

@@ -34,7 +34,8 @@ def effective_viscosity(solver, viscosity, decay):
 
 
 @pytest.mark.parametrize(
-    ("size", "dim"), [("tiny", 2), ("small", 2), ("tiny", 3), *(pytest.param("paper", dim, marks=pytest.mark.long) for dim in (2, 3))]
+    ("size", "dim"),
+    [("tiny", 2), ("tiny", 3), *(pytest.param(*case, marks=pytest.mark.long) for case in (("small", 2), ("paper", 2), ("paper", 3)))],
 )
 def test_effective_viscosity(size, dim, physics):
     """The nominal one and the grid's own add up; 3D is small and tiny on the same grid."""

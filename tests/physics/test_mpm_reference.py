@@ -90,6 +90,7 @@ SNOW_CONSTANTS = Snow(
 )
 
 
+@pytest.mark.long
 def test_collision_of_snow_blocks(reference, physics):
     """Both solvers agree particle by particle in free fall, before the floor. Ours takes smaller substeps once the snow has hardened."""
     pos = two_blocks()
@@ -99,6 +100,7 @@ def test_collision_of_snow_blocks(reference, physics):
     compare(physics, got, expected, pos, (0.01, 0.03, 0.03))
 
 
+@pytest.mark.long
 def test_collision_of_elastic_blocks(reference, physics):
     """The example's jelly is fixed-corotated with 0.3 E, ours neo-Hookean: equal for small strains only."""
     pos = two_blocks()

@@ -411,12 +411,12 @@ def test_without_hydra_the_output_lies_under_runs(tmp_path: Path) -> None:
         ),
         pytest.param(
             *("fit", ["training.num_steps=-1"], "error: training.num_steps=-1: must be "),
-            marks=pytest.mark.slow,
+            marks=pytest.mark.long,
         ),
         ("simulate", ["num_workers=0"], "error: num_workers=0: must be null (one per core) or an integer of at least 1"),
         pytest.param(
             *("benchmark", ["suite.num_rounds=none"], "error: suite.num_rounds='none': must be an integer"),
-            marks=pytest.mark.slow,
+            marks=pytest.mark.long,
         ),
     ],
 )

@@ -393,7 +393,7 @@ def decks() -> Any:
 
 @needs_ccx
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["cantilever", "plate", "quarter"])
+@pytest.mark.parametrize("case", ["cantilever", *(pytest.param(case, marks=pytest.mark.long) for case in ("plate", "quarter"))])
 def test_the_elastic_law_with_true_constants_follows_calculix(tmp_path: Path, case: str) -> None:
     """Clamps, planes of symmetry, forces, pressures and cells are those of CalculiX, which integrates plain hexahedra implicitly; nothing is trained."""
     made = decks()
