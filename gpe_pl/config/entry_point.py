@@ -259,7 +259,11 @@ def quoted(argument: str) -> str:
         return argument
     # Path.exists fails on names that are too long
     is_path = os.path.exists(value) or ("," not in value and os.path.isdir(os.path.dirname(value)))
-    return '{}="{}"'.format(key, value.replace('"', '\\"')) if is_path else argument
+    if not is_path:
+        return argument
+    # Hydra reads backslashes before a quote as escapes
+    escaped = re.sub(r'(\\*)("|$)', lambda m: 2 * m[1] + ('\\"' if m[2] else ""), value)
+    return f'{key}="{escaped}"'
 
 
 def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:

@@ -76,7 +76,7 @@ HEAVY = {"torch", "torch_geometric", "lightning", "torchmetrics", "numba", "scip
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["fit", pytest.param("evaluate", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("command", ["fit", "evaluate"])
 def test_help_of_a_command_loads_nothing_heavy(command: str) -> None:
     """So that it takes what Hydra takes to compose a configuration, about a second, and no more."""
     child = subprocess.run(

@@ -90,9 +90,7 @@ def test_no_level_changes_a_mesh(level: str, kind: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("decoder", ["node", "pair"])
 @pytest.mark.parametrize("edge_state", ["latent", "geometry"])
-@pytest.mark.parametrize(
-    "interaction", [pytest.param("directed", marks=pytest.mark.slow), "negated", "odd", pytest.param("odd_even", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("interaction", ["directed", "negated", "odd", "odd_even"])
 def test_no_level_changes_what_a_model_says(interaction: Any, edge_state: Any, decoder: Any) -> None:
     build = scenes.builder(THREE, history=2)
     data = scenes.to_dtype(build(scattered(THREE, ("sand", "fluid")).to_torch()), torch.float64)
@@ -111,7 +109,7 @@ def test_no_level_changes_what_a_model_says(interaction: Any, edge_state: Any, d
 
 @pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
-@pytest.mark.parametrize("implementation", ["factored", pytest.param("plain", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("implementation", ["factored", "plain"])
 def test_no_level_changes_a_rollout(level: str, implementation: Any) -> None:
     build = scenes.builder(THREE, history=2)
     simulated, start = (

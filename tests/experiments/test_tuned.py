@@ -66,9 +66,9 @@ def test_a_run_uses_the_values(path: Path) -> None:
     ("fem", "gpe_tuned", "by_data", True),
     ("fem", "gpe_tuned", "none", False),
     ("fem", "gpe", "by_data", False),
-    pytest.param("elastomer", "gpe_tuned", "by_data", False, marks=pytest.mark.slow),
+    ("elastomer", "gpe_tuned", "by_data", False),
     ("elastomer", "gpe_tuned", "elastic", True),
-    pytest.param("elastomer", "gpe", "elastic", True, marks=pytest.mark.slow),
+    ("elastomer", "gpe", "elastic", True),
 ])  # fmt: skip
 def test_a_law_sets_model_graph_and_training_together(data: str, model: str, law: str, is_elastic: bool) -> None:
     cfg = compose("fit", f"data={data}", f"model={model}", f"law={law}", "comparison=equal_steps")

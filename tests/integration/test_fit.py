@@ -340,7 +340,7 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("push_fraction", [pytest.param(0.0, marks=pytest.mark.slow), 0.6])
+@pytest.mark.parametrize("push_fraction", [0.0, 0.6])
 def test_one_corrupted_batch_does_not_end_a_run(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, push_fraction: float
 ) -> None:

@@ -112,11 +112,11 @@ def run(settings: Settings, specs: Mapping[str, DatasetSpec], folder: Path) -> t
 
 
 def _of_engine(name: EngineName, own: OfEngine, candidate: Candidate, settings: Settings, folder: Path) -> list[dict[str, Any]]:
-    has, needs = (candidate.spec.scene.materials, len(candidate.spec.scene.bounds)), ((SCENES[name].material,), DIMENSIONS[name])
-    if has != needs:
-        (materials, dim), (only, needed) = has, needs
+    materials, dim = candidate.spec.scene.materials, len(candidate.spec.scene.bounds)
+    if (materials, dim) != ((SCENES[name].material,), DIMENSIONS[name]):
         raise AdaptationError(
-            f"{name}: its scenes are of {only[0]} in {needed}D, and {own.checkpoint} was trained on {', '.join(materials)} in {dim}D; name another checkpoint"
+            f"{name}: its scenes are of {SCENES[name].material} in {DIMENSIONS[name]}D, and {own.checkpoint} was trained on {', '.join(materials)} in {dim}D; "
+            "name another checkpoint"
         )
     pairs, num_given_up = _made(name, candidate, settings, folder)
     dataset, tests = _stored(name, pairs, settings, folder), pairs[-settings.num_test :]

@@ -438,7 +438,7 @@ def test_a_path_is_taken_as_typed(tmp_path: Path) -> None:
     run = tmp_path / "data=sand" / "seed=0"
     run.mkdir(parents=True)
     assert compose("evaluate", quoted(f"checkpoint={run}")).checkpoint == str(run)
-    for name in ("müller", "a (1)", "a,b", 'inches"', "a#b", "näch'ste"):
+    for name in ("müller", "a (1)", "a,b", 'inches"', "a#b", "näch'ste", "ü\\", 'ü\\"'):
         (tmp_path / name).mkdir()
         assert compose("evaluate", quoted(f"checkpoint={tmp_path / name}")).checkpoint == str(tmp_path / name)
         if "," not in name:  # a folder that is still to be made

@@ -94,7 +94,7 @@ def test_layout(folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("num_workers", [1, 2])
 def test_resume_equals_uninterrupted(folder, tmp_path, num_workers):
     """Lose shards, damage one, leave a half-written file behind: the next run restores the same bytes."""
     again = generate(tmp_path, SPEC, num_workers)

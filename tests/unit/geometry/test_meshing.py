@@ -83,7 +83,7 @@ def test_plane_meshes(family, mesher, num_cells):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", SOLIDS)
-@pytest.mark.parametrize("num_cells", [400, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("num_cells", [400, 1000])
 def test_tetrahedra(family, num_cells):
     rng = np.random.default_rng(num_cells)
     distance, reach = random_solid(rng, family)

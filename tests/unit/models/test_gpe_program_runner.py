@@ -185,7 +185,7 @@ class DoubleBuilder(GraphBuilder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", [pytest.param(torch.float32, marks=pytest.mark.slow), torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_rollouts_of_100_steps(dtype: torch.dtype) -> None:
     """Edges change in every step. Graphs are in single precision unless the builder says otherwise."""
     states = [scenes.state(n, seed=n, high=0.3).to_torch() for n in (30, 12)]

@@ -249,7 +249,7 @@ def test_a_mirror_image_moves_as_the_mirror_image(kind: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [k if k in ("triangles", "tetrahedra") else pytest.param(k, marks=pytest.mark.slow) for k in KINDS])
+@pytest.mark.parametrize("kind", KINDS)
 def test_energy_is_kept_without_viscosity_and_dissipated_with_it(kind: str) -> None:
     """Substeps change from frame to frame, so leapfrog's energy changes by up to 10 % in 200 frames."""
     energies: dict[float, np.ndarray] = {}

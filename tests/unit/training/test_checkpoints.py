@@ -238,7 +238,7 @@ def test_without_the_best_checkpoint_the_next_validation_makes_one(data: Path, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("push_fraction", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
+@pytest.mark.parametrize("push_fraction", [0.0, 1.0])
 def test_a_checkpoint_between_validations_is_as_good_as_any(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, push_fraction: float
 ) -> None:
@@ -276,7 +276,9 @@ def test_checkpoints_between_validations_come_when_their_time_has_passed(data: P
     ("number", "step", "saved"),
     [
         (signal.SIGTERM, 3, 4),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in [(signal.SIGINT, 3, 4), (signal.SIGINT, 2, 3), (signal.SIGTERM, 8, 9)]),
+        (signal.SIGINT, 3, 4),
+        (signal.SIGINT, 2, 3),
+        (signal.SIGTERM, 8, 9),
     ],
 )
 def test_an_interrupted_training_is_saved_where_it_is(data: Path, tmp_path: Path, number: int, step: int, saved: int) -> None:
@@ -456,7 +458,7 @@ CONTENTS: dict[str, Any] = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", [pytest.param(key, marks=[] if key == "loops" else pytest.mark.slow) for key in CONTENTS])
+@pytest.mark.parametrize("key", CONTENTS)
 def test_wrong_contents_of_a_checkpoint_are_named_in_one_line(data: Path, tmp_path: Path, key: str) -> None:
     with pytest.raises(Killed):
         trained(data, tmp_path / "run", at={4: stop(Killed)})

@@ -186,16 +186,13 @@ def checkpoint(run: Path, name: str) -> dict[str, Any]:
     return torch.load(run / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
-SLOW = pytest.mark.slow
-
-
 @pytest.mark.parametrize(
     ("size", "late"),
     [
         pytest.param(BatchSize(3), False, marks=pytest.mark.long),
         pytest.param(BatchSize(3, max_nodes=64), False, marks=pytest.mark.long),
         pytest.param(BatchSize(3), True, marks=pytest.mark.long, id="push-forward"),
-        pytest.param(BatchSize(3, max_nodes=64), True, marks=SLOW, id="push-forward by nodes"),
+        pytest.param(BatchSize(3, max_nodes=64), True, marks=pytest.mark.slow, id="push-forward by nodes"),
     ],
 )
 def test_two_processes_train_like_one(mixed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: BatchSize, late: bool) -> None:

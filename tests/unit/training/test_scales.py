@@ -204,7 +204,7 @@ DECIMAL = [(1e-6, 1e4), (1e-3, 1.0), (1e6, 1e-4), (1e-6, 1e-4), (1e6, 1e4)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("length", "time"), [DECIMAL[0], *(pytest.param(*factors, marks=pytest.mark.slow) for factors in DECIMAL[1:])])
+@pytest.mark.parametrize(("length", "time"), DECIMAL)
 def test_decimal_units_change_the_first_losses_by_rounding_only(length: float, time: float, folder: Path) -> None:
     expected = losses(data(folder, 1.0, 1.0), "GPE", 10)
     np.testing.assert_allclose(losses(data(folder, length, time), "GPE", 10), expected, rtol=1e-4)
