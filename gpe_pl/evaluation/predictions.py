@@ -15,7 +15,6 @@ from gpe_pl.data.dataset import long_enough, open_split
 from gpe_pl.evaluation.material_controls import UNSEEN, AtValue, MaterialControls, label_of
 from gpe_pl.evaluation.metric_rows import EXACT
 from gpe_pl.evaluation.rollout_cost import Timed
-from gpe_pl.evaluation.scene_files import check_scene
 from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.geometry.shapes import surface_tolerance
 from gpe_pl.learned.approximate import approximate
@@ -103,8 +102,6 @@ class Predictor:
             on_progress(done, total)
             while batch := list(islice(scenes, SCENES_AT_ONCE)):
                 numbers, trajectories = [number for number, _ in batch], [trajectory for _, trajectory in batch]
-                for trajectory in trajectories:
-                    check_scene(self.settings, trajectory, members_of(self.simulator)[0].builder.metadata)
                 yield from self._batch(trajectories, numbers, controls, _each(on_progress, done, total))
                 done += self._num_frames([t.num_frames for t in trajectories])
                 on_progress(done, total)  # rollouts that stopped early lack frames

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterable, Iterator
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from gpe_pl.data.dataset import WindowDataset, every, open_split, usable
+from gpe_pl.data.dataset import WindowDataset, every, long_enough, open_split, usable
 from gpe_pl.evaluation.horizons import labels
 from gpe_pl.evaluation.material_controls import MaterialControls
 from gpe_pl.evaluation.metric_rows import LEARNED, About, Row, write_rows
 from gpe_pl.evaluation.predictions import SCENES_AT_ONCE, PredictedScene, Predictor
 from gpe_pl.evaluation.rollout_cost import write_cost
-from gpe_pl.evaluation.scene_files import check_formats, write_models
+from gpe_pl.evaluation.scene_files import MODELS, check_formats, check_scene, write_models
 from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.evaluation.split_files import SplitFiles
 from gpe_pl.export.play_page import SolverFilm
@@ -24,7 +26,7 @@ from gpe_pl.learned.ensemble import LearnedEnsemble, configured, members_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, rollout_metrics
 from gpe_pl.nn.stores import predicted_rows
-from gpe_pl.schema import param_names
+from gpe_pl.schema import Split, param_names
 from gpe_pl.system.progress import Bars, no_bar
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
@@ -85,7 +87,7 @@ def evaluate(
     Raises:
         StartError: ``settings.start_time`` leaves too little history, or is between frames.
         SceneError: the data do not fit the simulator.
-        ExportError, PageError: a format in ``settings.export`` cannot be written.
+        ExportError, OnnxError, PageError: a format in ``settings.export`` cannot be written. Nothing was rolled out before.
         RigidBodyError: a scene has rigid bodies, which a format in ``settings.export`` would ignore.
     """
     if members_of(simulator)[0].builder.config.scales != "one":
@@ -96,8 +98,11 @@ def evaluate(
     simulator = _as_evaluated(simulator, settings)
     check_formats(settings, simulator)
     run_dir.mkdir(parents=True, exist_ok=True)
+    if MODELS & {*settings.export}:  # before the rollouts, which would be lost with a model that cannot be written
+        films = [film for split in settings.splits for film in _films(root, split, settings, first, start_frame, stride)]
+        write_models(run_dir, members_of(simulator)[0], label, films, settings.export)
     predictor = Predictor(simulator, settings, label, controls, stride, start_frame, seconds=[], bars=bars)
-    rows, films = list[Row](), list[SolverFilm]()
+    rows = list[Row]()
     for split in settings.splits:
         rows.append(Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split, stride=stride)))
         files = SplitFiles(run_dir, split, label, settings)
@@ -107,13 +112,20 @@ def evaluate(
             rows += see(scene, about) if see else []
             files.add(scene, about)
         files.finish()
-        films += files.films
-    write_models(
-        run_dir, members_of(simulator)[0], label, films, settings.export
-    )  # before the metrics, because a run with metrics counts as finished
     write_cost(run_dir, predictor.seconds, frame_dt)
-    write_rows(run_dir / "metrics.csv", rows)
+    write_rows(run_dir / "metrics.csv", rows)  # last, because a run with metrics counts as finished
     return rows
+
+
+def _films(
+    root: Path, split: Split, settings: EvaluationSettings, simulator: LearnedSimulator, start_frame: int, stride: int
+) -> Iterator[SolverFilm]:
+    """Check all scenes of a split that are evaluated, and yield those that get pictures."""
+    wanted = math.inf if settings.num_trajectories is None else settings.num_trajectories
+    for number, trajectory in takewhile(lambda scene: scene[0] < wanted, long_enough(root, split, start_frame, stride)):
+        check_scene(settings, trajectory, simulator.builder.metadata)
+        if number < settings.num_pictures:
+            yield SolverFilm(f"{split} {number}", trajectory)
 
 
 def _scene_in(root: Path, split: str, stride: int) -> Metadata:

@@ -32,6 +32,8 @@ VIEWER_BYTES = 2**26
 
 VECTOR: tuple[Export, ...] = ("svg", "pdf")
 """Formats in which figures are written beside PNG."""
+MODELS: set[Export] = {"model", "onnx", "page"}
+"""Formats that hold a model."""
 
 
 class ExportError(GpeError):
@@ -47,7 +49,7 @@ def check_formats(settings: EvaluationSettings, simulator: LearnedSimulator | Le
         OnnxError: the model is no GPE.
     """
     formats = settings.export
-    single = [kind for kind in ("model", "onnx", "page") if kind in formats]
+    single = [kind for kind in formats if kind in MODELS]
     if isinstance(simulator, LearnedEnsemble):
         if single:
             raise ExportError(f"evaluation.export: {single[0]} takes a single checkpoint; leave it out, or evaluate one checkpoint")

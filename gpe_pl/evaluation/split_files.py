@@ -13,7 +13,6 @@ from gpe_pl.evaluation.metric_rows import EXACT, About
 from gpe_pl.evaluation.predictions import PredictedScene
 from gpe_pl.evaluation.scene_files import save, write_error_curve, write_exports, write_parameter_picture, write_pictures
 from gpe_pl.evaluation.settings import EvaluationSettings
-from gpe_pl.export.play_page import SolverFilm
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.metrics import per_frame_mse
 from gpe_pl.metrics.quantities import Quantity, quantities
@@ -33,14 +32,12 @@ class SplitFiles:
         split: name of the split.
         label: name of the model.
         settings: settings of the evaluation.
-        films: trajectories of the scenes with pictures.
     """
 
     run_dir: Path
     split: str
     label: str
     settings: EvaluationSettings
-    films: list[SolverFilm] = field(default_factory=list)
     _curves: dict[str, list[np.ndarray]] = field(default_factory=dict)
     _numbers: list[tuple[About, str, Quantity, float]] = field(default_factory=list)
     _truth: Trajectory | None = None
@@ -57,7 +54,6 @@ class SplitFiles:
             write_exports(self.run_dir, self.split, number, scene.truth, scene.predictions[self.label], formats)
             if scene.at_values:
                 write_parameter_picture(self.run_dir / f"parameters_{self.split}_{number:02d}.png", scene.at_values, formats)
-            self.films.append(SolverFilm(f"{self.split} {number}", scene.trajectory))
         if self.settings.quantities:
             self._add_quantities(scene, about)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from gpe_pl.errors import GpeError
-from gpe_pl.export.onnx_network import TOLERANCE
+from gpe_pl.export.onnx_network import tolerance
 from gpe_pl.export.program import export_model, scene_of
 from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -40,7 +40,7 @@ def export_compiled(simulator: LearnedSimulator, path: Path | str, states: Seque
         The largest difference of a position after these steps [m].
 
     Raises:
-        CompiledProgramError: the compiled program moves a node elsewhere, by more than ``TOLERANCE``; nothing is written.
+        CompiledProgramError: the compiled program moves a node elsewhere, by more than ``onnx_network.tolerance``; nothing is written.
         ValueError: ``path`` has another file type, or there are no states.
         CellError, MirrorAverageError, LeastDistanceError, NodeLoadError, RigidBodyError, OpenSceneError: as ``export_model`` and ``scene_of`` raise them.
     """
@@ -59,9 +59,10 @@ def export_compiled(simulator: LearnedSimulator, path: Path | str, states: Seque
         for state, scene in zip(states, scenes, strict=True):
             moved, expected = step(scene)[0], scene_of(simulator, simulator.step(state))
             found = max(found, *(float((moved[name] - expected[name]).abs().max()) for name in moved if name.startswith("pos.")))
-        if not found <= TOLERANCE:
+        allowed = tolerance(states)
+        if not found <= allowed:
             raise CompiledProgramError(
-                f"one step of the compiled program differs from that of the model by {found:.3g} m, at most {TOLERANCE:g} m are allowed"
+                f"one step of the compiled program differs from that of the model by {found:.3g} m, at most {allowed:.3g} m are allowed"
             )
         replace_bytes(Path(path), compiled.read_bytes())
     return found

@@ -35,7 +35,9 @@ from gpe_pl.models.gpe_program_runner import Decoded
 from gpe_pl.trajectory.state import State
 
 TOLERANCE = 1e-6
-"""Largest difference of a position after one step [m]."""
+"""Largest difference of a position after one step [m], in scenes whose coordinates are so small that rounding is smaller (see ``tolerance``)."""
+ROUNDINGS = 4
+"""Number of roundings of the largest coordinate by which a position may differ."""
 
 Arguments = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor], dict[str, Tensor], dict[Any, tuple[Tensor, Tensor, Tensor]]]
 """Arguments of ``GPE.compute``."""
@@ -156,6 +158,12 @@ def difference(simulator: LearnedSimulator, other: LearnedSimulator, states: Seq
     return max(float((simulator.step(s).pos - other.step(s).pos).abs().max()) for s in states)
 
 
+def tolerance(states: Sequence[State]) -> float:
+    """Return the largest difference of a position that is allowed after one step from these states [m]."""
+    largest = max(float(state.pos.abs().max()) for state in states)
+    return max(TOLERANCE, ROUNDINGS * torch.finfo(torch.float32).eps * largest)
+
+
 def check_network(simulator: LearnedSimulator) -> None:
     """Raise ``OnnxError`` for a simulator whose model is no GPE."""
     if type(simulator.model) is not GPE:
@@ -174,7 +182,7 @@ def export_network(simulator: LearnedSimulator, path: Path | str, states: Sequen
         The largest difference of a position after these steps [m].
 
     Raises:
-        OnnxError: the model is no GPE, or the exported network moves a node elsewhere, by more than ``TOLERANCE``; nothing is written.
+        OnnxError: the model is no GPE, or the exported network moves a node elsewhere, by more than ``tolerance``; nothing is written.
         ValueError: ``path`` has another file type, or there are no states.
     """
     path = Path(path)
@@ -184,10 +192,11 @@ def export_network(simulator: LearnedSimulator, path: Path | str, states: Sequen
         raise ValueError("states: give at least one, in which the exported network is compared with the model")
     check_network(simulator)
     content = _program(simulator, _arguments(simulator, states[0]))
-    found = difference(simulator, simulator_of(simulator, content), states)
-    if not found <= TOLERANCE:
+    found, allowed = difference(simulator, simulator_of(simulator, content), states), tolerance(states)
+    if not found <= allowed:
         raise OnnxError(
-            f"one step of the exported network differs from that of the model by {found:.3g} m, at most {TOLERANCE:g} m are allowed"
+            f"one step of the exported network differs from that of the model by {found:.3g} m, at most {allowed:.3g} m are allowed; "
+            "leave onnx out of evaluation.export"
         )
     replace_bytes(path, content)
     return found

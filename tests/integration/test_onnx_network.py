@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import jaxtyping
 import pytest
 
 from gpe_pl.export import onnx_network
-from gpe_pl.export.onnx_network import TOLERANCE, OnnxError, export_network
+from gpe_pl.export.onnx_network import TOLERANCE, OnnxError, export_network, tolerance
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import steps
 from gpe_pl.scenes.recorded import recorded_scene
@@ -54,6 +55,13 @@ def test_a_network_that_differs_is_not_written(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(OnnxError, match=r"one step of the exported network differs from that of the model by .* m, at most 1e-06 m"):
         export_network(simulator, tmp_path / "network.onnx", starts(simulator, 1))
     assert not any(tmp_path.iterdir())
+
+
+def test_positions_far_from_the_origin_may_differ_by_their_rounding() -> None:
+    simulator = LearnedSimulator.from_checkpoint("sand")
+    state = simulator.standing(recorded_scene(simulator.builder.metadata).sample(middle_values(simulator), 0), simulator.builder.metadata)
+    assert tolerance([state]) == TOLERANCE
+    assert tolerance([state, replace(state, pos=state.pos + 100.0)]) == pytest.approx(4 * 2**-23 * 100, rel=0.1)
 
 
 def test_another_file_type_is_refused(tmp_path: Path) -> None:
