@@ -270,7 +270,15 @@ def _settings(solver: Any, named: Solver) -> dict[str, Any]:
 
 
 def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
-    """Return the seed of one scene, which differs for every seed of the data set, split and index."""
+    """Return the seed of one scene, which differs for every seed of the data set, split and index.
+
+    Raises:
+        GenerationError: there is no such split, or ``index`` is no number from 0 on.
+    """
+    if split not in SPLITS:
+        raise GenerationError(f"split={split!r}: no such split; the splits are {', '.join(SPLITS)}")
+    if index < 0:
+        raise GenerationError(f"index={index}: must be a number of a trajectory, from 0 on")
     words = np.random.SeedSequence((spec.seed, SPLITS.index(split), spec.scene_number(split, index))).generate_state(2, np.uint32)
     return int(words[0]) << 32 | int(words[1])
 
@@ -379,6 +387,13 @@ def generate_trajectory(
     trajectory = rollout(spec.label_solver, state, (num_frames or spec.num_frames) - 1, metadata, guard)
     if trajectory.termination is not None:
         stop = trajectory.termination
-        advice = "raise the solver's max_substeps or lower" if stop.reason == "explosion" else "lower the solver's cfl or"
-        raise GenerationError(f"{label}: {stop.reason}: {stop.message}; {advice} the scene's max_speed", split, index, metadata.seed)
+        raise GenerationError(f"{label}: {stop.reason}: {stop.message}{_advice(stop.reason)}", split, index, metadata.seed)
     return trajectory
+
+
+def _advice(reason: str) -> str:
+    """Return what may help against a failure of the solver. Nothing of it helps against a start or a parameter that the solver refuses."""
+    if reason in ("input", "material"):
+        return ""
+    first = "raise the solver's max_substeps or lower" if reason == "explosion" else "lower the solver's cfl or"
+    return f"; {first} the scene's max_speed"

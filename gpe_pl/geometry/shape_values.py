@@ -59,9 +59,8 @@ def shapes_fault(shapes: Sequence[Shape], space: Periodicity) -> str | None:
     for k, shape in enumerate(shapes):
         if isinstance(shape, Repeated) and shape.periodicity != space:
             return f"shape {k} repeats along {shape.periodicity}, the domain along {space}"
-        inner = shape.shape if isinstance(shape, Repeated) else shape
-        if wrong := shape_fault(inner, len(space.bounds)):
-            return f"shape {k} ({inner.kind}): {wrong}"
+        if wrong := shape_fault(shape, len(space.bounds)):
+            return f"shape {k} ({shape.shape.kind if isinstance(shape, Repeated) else shape.kind}): {wrong}"
     return None
 
 
@@ -70,6 +69,8 @@ _SCALARS = {"friction", "restitution", "radius", "offset", "spacing"}
 
 def shape_fault(shape: Shape, dim: int) -> str | None:
     """Describe the first rule of ``shapes_fault`` that a shape in ``dim`` dimensions breaks; None if it breaks none, or is of another class."""
+    if isinstance(shape, Repeated):
+        return shape_fault(shape.shape, dim)
     if type(shape) not in SHAPES.values():
         return None
     values: dict[str, np.ndarray] = {}

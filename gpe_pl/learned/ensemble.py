@@ -24,9 +24,21 @@ class LearnedEnsemble(Ensemble):
 
     Attributes:
         members: models with the same frame interval, spacing, materials and history.
+
+    Raises:
+        CheckpointError: there is no member, or one does not fit the first.
     """
 
     members: tuple[LearnedSimulator, ...]
+
+    def __post_init__(self) -> None:
+        if not self.members:
+            raise CheckpointError("an ensemble needs at least one model")
+        for number, other in enumerate(self.members[1:], start=1):
+            if not _fit(self.members[0], other):
+                raise CheckpointError(
+                    f"member {number} has other materials, frames, spacing or history than member 0; members of an ensemble share them"
+                )
 
     @classmethod
     def from_checkpoints(cls, checkpoints: Sequence[Path | str], device: Any = "cpu") -> LearnedEnsemble:
@@ -42,10 +54,8 @@ class LearnedEnsemble(Ensemble):
         if not checkpoints:
             raise CheckpointError("an ensemble needs at least one checkpoint; name some")
         members = tuple(LearnedSimulator.from_checkpoint(path, device) for path in checkpoints)
-        first = members[0]
         for path, other in zip(checkpoints[1:], members[1:], strict=True):
-            own, there = first.builder, other.builder
-            if not (first.fits(there.metadata) and other.fits(own.metadata)) or own.config.history != there.config.history:
+            if not _fit(members[0], other):
                 raise CheckpointError(
                     f"{path}: has other materials, frames, spacing or history than {checkpoints[0]}; members of an ensemble share them"
                 )
@@ -62,6 +72,11 @@ class LearnedEnsemble(Ensemble):
     def standing(self, state: State, scene: Metadata) -> State:
         """Do the same as ``LearnedSimulator.standing``."""
         return self.members[0].standing(state, scene)
+
+
+def _fit(one: LearnedSimulator, other: LearnedSimulator) -> bool:
+    own, there = one.builder, other.builder
+    return one.fits(there.metadata) and other.fits(own.metadata) and own.config.history == there.config.history
 
 
 def members_of(simulator: LearnedSimulator | LearnedEnsemble) -> tuple[LearnedSimulator, ...]:

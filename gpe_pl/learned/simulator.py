@@ -10,7 +10,7 @@ import copy
 import io
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
+from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
@@ -57,6 +58,10 @@ from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 log = logging.getLogger(__name__)
 
 CHECKPOINT_FORMAT = 3
+
+
+class PrecisionError(GpeError, ValueError):
+    """Raised when a simulator should compute in a precision other than float32 and float64."""
 
 
 class LearnedSimulator(nn.Module):
@@ -116,6 +121,14 @@ class LearnedSimulator(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         state_dict.setdefault(f"{prefix}trained_mass", training_ranges.any_mass(self.builder.spec.materials))  # shipped models lack it
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> LearnedSimulator:
+        wanted = fn(torch.zeros(0)).dtype
+        if wanted not in (torch.float32, torch.float64):
+            raise PrecisionError(
+                f"{wanted}: a simulator computes in float32 or float64; positions of half precision lose the motion of a frame"
+            )
+        return super()._apply(fn, recurse)  # type: ignore[return-value]
 
     @property
     def skips(self) -> Skips:

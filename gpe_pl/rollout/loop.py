@@ -125,23 +125,32 @@ class GroundTruth(Protocol):
 
 def unfit(simulator: Simulator, metadata: Metadata) -> Termination | None:
     """Return the reason why a simulator cannot compute a scene: another frame interval, or a solver for other materials. None means that it can."""
-    own = _innermost(simulator)
-    frame_dt, wrong = getattr(own, "frame_dt", metadata.frame_dt), ""
-    solver = f"the solver {own.name}" if isinstance(own, GroundTruth) else "the model"
-    if not math.isclose(frame_dt, metadata.frame_dt, rel_tol=1e-6):
-        wrong = f"{solver} has frame_dt = {frame_dt:g} s, the scene {metadata.frame_dt:g} s"
-    elif not isinstance(simulator, GroundTruth):
-        return None
-    elif tuple(simulator.materials) != metadata.materials:
-        wrong = f"{solver} has the materials {', '.join(simulator.materials)}, the scene {', '.join(metadata.materials)}, in this order"
-    return Termination("input", 0, -1, f"{wrong}; both must be the same") if wrong else None
+    for layer in _layers(simulator):
+        frame_dt = getattr(layer, "frame_dt", getattr(layer, "dt", metadata.frame_dt))
+        if not math.isclose(frame_dt, metadata.frame_dt, rel_tol=1e-6):
+            return _unlike(f"{_named(layer)} has frame_dt = {frame_dt:g} s, the scene {metadata.frame_dt:g} s")
+    if isinstance(simulator, GroundTruth) and tuple(simulator.materials) != metadata.materials:
+        own, there = ", ".join(simulator.materials), ", ".join(metadata.materials)
+        return _unlike(f"{_named(simulator)} has the materials {own}, the scene {there}, in this order")
+    return None
 
 
-def _innermost(simulator: Any) -> Any:
-    """Return the simulator inside wrappers such as containment; of an ensemble, that of its first member."""
-    while (inner := getattr(simulator, "simulator", None) or next(iter(getattr(simulator, "members", ())), None)) is not None:
-        simulator = inner
-    return simulator
+def _layers(simulator: Any) -> Iterator[Any]:
+    """Yield the simulators inside a simulator, such as the one inside containment or the members of an ensemble, and then the simulator."""
+    inner = getattr(simulator, "simulator", None)
+    for part in (*getattr(simulator, "members", ()), *(() if inner is None else (inner,))):
+        yield from _layers(part)
+    yield simulator
+
+
+def _named(simulator: Any) -> str:
+    if isinstance(simulator, GroundTruth):
+        return f"the solver {simulator.name}"
+    return "the model" if hasattr(simulator, "frame_dt") else type(simulator).__name__
+
+
+def _unlike(difference: str) -> Termination:
+    return Termination("input", 0, -1, f"{difference}; both must be the same")
 
 
 @dataclass(frozen=True)
@@ -319,7 +328,7 @@ class _Recording:
             else None
         )
         return Trajectory(
-            self.start.metadata,
+            _with_gravity(self.start.metadata, state),
             pos,
             vel,
             _numpy(state.node_type),
@@ -341,6 +350,14 @@ class _Recording:
         )
 
 
+def _with_gravity(metadata: Metadata, state: State) -> Metadata:
+    """Return the metadata with the gravity of the state, which may have another than its scene."""
+    gravity = as_numpy(state.gravity)
+    if gravity.shape != (metadata.dim,) or np.allclose(gravity, metadata.gravity, rtol=1e-6, atol=0.0):  # other shapes end the rollout
+        return metadata
+    return replace(metadata, gravity=tuple(gravity.tolist()))
+
+
 def rollout(
     simulator: Simulator,
     state: State,
@@ -355,7 +372,7 @@ def rollout(
         simulator: solver, learned model, baseline or ``Replay``.
         state: initial state, which becomes frame 0.
         num_steps: number of frames to add.
-        metadata: metadata of the scene, which also describe the result.
+        metadata: metadata of the scene, which also describe the result. Its gravity is that of the state.
         guard: stops the rollout at the first state that it rejects.
         on_frame: called with frame number and state.
 

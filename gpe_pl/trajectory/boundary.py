@@ -11,6 +11,7 @@ from array_api_compat import array_namespace
 
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.geometry.repeated_shapes import is_covered, repeated
+from gpe_pl.geometry.shape_values import shape_fault
 from gpe_pl.geometry.shapes import Shape, surface_tolerance
 from gpe_pl.schema import STICKY
 from gpe_pl.trajectory.arrays import ArrayError, nearest_distances, numbers, per_node, positive
@@ -82,7 +83,15 @@ class Boundary:
         """Return a boundary of nodes on the surfaces of shapes and of their periodic images, about ``spacing`` [m] apart.
 
         Nodes inside another shape are left out.
+
+        Raises:
+            ArrayError: a shape breaks a rule of ``shape_values.shapes_fault``, or ``spacing`` is not positive. The message has the number of the shape.
+            SamplingError: there would be too many nodes.
         """
+        positive("spacing", spacing, "m")
+        for number, shape in enumerate(shapes):
+            if wrong := shape_fault(shape, dim):
+                raise ArrayError(f"shape {number} ({shape.kind}): {wrong}")
         shapes = repeated(tuple(shapes), periodicity)
         pos, normal, friction, restitution = [np.empty((0, dim))], [np.empty((0, dim))], [np.empty(0)], [np.empty(0)]
         rounding = 1e-3 * surface_tolerance(shapes)

@@ -507,9 +507,9 @@ def shards(root: Path | str, split: str) -> list[Path]:
     found = sorted((Path(root) / split).glob("shard-*.h5"))
     if not found:
         others = sorted({path.parent.name for path in Path(root).glob("*/shard-*.h5")})
+        lacks = f"has no split {split!r} but {', '.join(others)}" if others else "has no trajectories of any split"
         raise StoreError(
-            f"{root}: has no split {split!r} but {', '.join(others) or 'none'}; generate it with `python -m gpe_pl.simulate`, import data that have it, "
-            "or choose another split"
+            f"{root}: {lacks}; generate it with `python -m gpe_pl.simulate`, import data that have it, or choose another split"
         )
     return found
 

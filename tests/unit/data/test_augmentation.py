@@ -12,7 +12,7 @@ import torch
 
 from gpe_pl.data.augmentation import Augmentation, AugmentationError, boosted, turned_with_gravity
 from gpe_pl.data.dataset import StartKey, StoredTrajectory, WindowDataset
-from gpe_pl.geometry.shapes import Box, Shape, Wall, domain_walls
+from gpe_pl.geometry.shapes import Box, Wall, domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.training.run import TrainingSettings
@@ -178,9 +178,10 @@ def test_obstacles_and_ramps_do_not_hide_the_floor(truth: Trajectory) -> None:
     floor = domain_walls(truth.metadata.bounds, 0.3)[2]
     raised = Box((0.4, 0.3, 0.2), (0.6, 0.5, 0.4), 0.3)
     ramp = Wall((-np.sin(0.6), np.cos(0.6), 0.0), 0.0, low, high, 0.3)
-    cases: list[tuple[tuple[Shape, ...], list[int]]] = [((floor, raised), [0, 2]), ((ramp,), [2]), ((raised,), [0, 1, 2])]
-    for shapes, level in cases:
-        scene = under(replace(truth, boundary=Boundary.sample(shapes, 0.05, 3)), gravity=(0.0, 0.0, 0.0))
+    inclined = Boundary.from_numpy(*ramp.sample(0.05), shapes=(ramp,))
+    cases = [(Boundary.sample((floor, raised), 0.05, 3), [0, 2]), (inclined, [2]), (Boundary.sample((raised,), 0.05, 3), [0, 1, 2])]
+    for boundary, level in cases:
+        scene = under(replace(truth, boundary=boundary), gravity=(0.0, 0.0, 0.0))
         assert np.flatnonzero(images(scene).any(axis=0)).tolist() == level
 
 

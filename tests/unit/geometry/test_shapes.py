@@ -13,6 +13,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from gpe_pl.geometry.periodicity import Periodicity
 from gpe_pl.geometry.shape_values import SHAPES, moved, shape_from_dict, shape_to_dict
 from gpe_pl.geometry.shapes import (
     Bowl,
@@ -27,6 +28,7 @@ from gpe_pl.geometry.shapes import (
     outward_normal,
     signed_distance,
 )
+from gpe_pl.trajectory.arrays import ArrayError
 from gpe_pl.trajectory.boundary import Boundary
 
 CONCAVE = ((0.2, 0.2), (0.9, 0.1), (0.5, 0.5), (0.8, 0.9), (0.2, 0.8))
@@ -431,3 +433,28 @@ def test_unusable_grid_values_are_refused() -> None:
 def test_a_surface_with_more_nodes_than_fit_into_memory_is_refused(shape: Shape) -> None:
     with pytest.raises(SamplingError, match=r"would have \S+ boundary nodes, at most 10000000 are made; choose a larger spacing"):
         shape.sample(1e-9)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "spacing", "message"),
+    [
+        (domain_walls(((1.0, 0.0), (0.0, 1.0)), 0.5), 0.1, r"shape 0 \(wall\): low must be below high along every axis"),
+        (domain_walls(((0.0, 1.0), (0.0, 1.0)), -0.5), 0.1, r"shape 0 \(wall\): friction is -0.5, must be at least 0"),
+        (
+            (*domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.5), Sphere((0.5, 0.5), -0.1, 0.5)),
+            0.1,
+            r"shape 4 \(sphere\): radius is -0.1 m, must be positive",
+        ),
+        ((Sphere((0.5, 0.5, 0.5), 0.1, 0.5),), 0.1, r"shape 0 \(sphere\): center must have 2 components"),
+        ((Box((0.5, 0.5), (0.4, 0.6), 0.5),), 0.1, r"shape 0 \(box\): low must be below high"),
+        ((Sphere((0.5, 0.5), 0.1, float("nan")),), 0.1, r"shape 0 \(sphere\): not finite: friction"),
+        ((Sphere((0.5, 0.5), 0.1, 0.5),), 0.0, "spacing=0.0: must be a positive number of m"),
+        ((Sphere((0.5, 0.5), 0.1, 0.5),), -0.1, "spacing=-0.1: must be a positive number of m"),
+    ],
+)
+def test_nodes_are_placed_on_sound_shapes_only(shapes: tuple[Shape, ...], spacing: float, message: str) -> None:
+    with pytest.raises(ArrayError, match=message):
+        Boundary.sample(shapes, spacing, 2)
+    if spacing > 0:
+        with pytest.raises(ArrayError, match=message):
+            Boundary.sample(shapes, spacing, 2, Periodicity(((0.0, 1.0), (0.0, 1.0)), (True, False)))

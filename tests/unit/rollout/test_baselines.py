@@ -15,6 +15,7 @@ from gpe_pl.trajectory.state import State
 from tests import scenes
 
 DT, G = 0.01, -9.81
+SCENE = replace(scenes.metadata(), frame_dt=DT)
 WALLS: tuple[Shape, ...] = domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.3)
 OBSTACLES: tuple[Shape, ...] = (
     Sphere((0.3, 0.3), 0.15, 0.3),
@@ -38,7 +39,7 @@ def cloud(shapes: tuple[Shape, ...], count: int = 500) -> State:
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
 def test_constant_velocity(backend: str) -> None:
     start = cloud(WALLS)
-    result = rollout(ConstantVelocity(DT), start.to_torch() if backend == "torch" else start, 30, scenes.metadata())
+    result = rollout(ConstantVelocity(DT), start.to_torch() if backend == "torch" else start, 30, SCENE)
     for k in (1, 30):
         np.testing.assert_allclose(result.pos[k], start.pos + k * DT * start.vel, atol=1e-12)
         np.testing.assert_array_equal(result.vel[k], start.vel)
@@ -50,7 +51,7 @@ def test_constant_velocity(backend: str) -> None:
 def test_ballistic_is_free_fall_where_nothing_is_in_the_way(backend: str, at_rest: bool) -> None:
     start = cloud(())
     start = replace(start, vel=np.zeros_like(start.vel)) if at_rest else start
-    result = rollout(Ballistic(DT), start.to_torch() if backend == "torch" else start, 40, scenes.metadata())
+    result = rollout(Ballistic(DT), start.to_torch() if backend == "torch" else start, 40, SCENE)
     for k in (1, 7, 40):
         fall = np.array([0.0, G])
         np.testing.assert_allclose(result.vel[k], start.vel + k * DT * fall, atol=1e-11)
@@ -62,7 +63,7 @@ def test_ballistic_is_free_fall_where_nothing_is_in_the_way(backend: str, at_res
 @pytest.mark.parametrize("shapes", [WALLS, WALLS + OBSTACLES], ids=["walls", "obstacles"])
 def test_ballistic_never_enters_a_wall_and_sticks_where_it_touches(shapes: tuple[Shape, ...], backend: str) -> None:
     start = cloud(shapes)
-    result = rollout(Ballistic(DT), start.to_torch() if backend == "torch" else start, 120, scenes.metadata())
+    result = rollout(Ballistic(DT), start.to_torch() if backend == "torch" else start, 120, SCENE)
     distance = signed_distance(shapes, result.pos)
     assert distance.min() >= 0
     at_rest = (result.vel == 0).all(axis=-1)
@@ -88,7 +89,7 @@ def test_ballistic_stops_on_its_path() -> None:
 def test_a_node_at_rest_on_a_wall_stays_there() -> None:
     shapes = WALLS + OBSTACLES
     start = state(np.array([[0.5, 0.0], [0.0, 0.7], [0.5, 1.0], [0.3, 0.45]]), np.zeros((4, 2)), shapes)
-    result = rollout(Ballistic(DT), start, 10, scenes.metadata())
+    result = rollout(Ballistic(DT), start, 10, SCENE)
     np.testing.assert_array_equal(result.pos[-1], start.pos)
 
 
@@ -98,7 +99,7 @@ def test_constant_velocity_stops_at_walls(backend: str) -> None:
     shapes = WALLS + OBSTACLES
     start = cloud(shapes)
     assert start.gravity[1] == G  # which it knows nothing of
-    result = rollout(StopsAtWalls(DT), start.to_torch() if backend == "torch" else start, 120, scenes.metadata())
+    result = rollout(StopsAtWalls(DT), start.to_torch() if backend == "torch" else start, 120, SCENE)
     distance = signed_distance(shapes, result.pos)
     assert distance.min() >= 0
     at_rest = (result.vel == 0).all(axis=-1)
@@ -131,8 +132,8 @@ def test_baselines_are_the_same_in_any_unit(baseline: type, length: float, time:
     vel = np.array([[0.5, -1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [9.0, 0.0]])
     start = state(pos, vel, shapes)
     other = replace(state(length * pos, length / time * vel, scaled, spacing=0.1 * length), gravity=start.gravity * length / time**2)
-    expected = rollout(baseline(DT), start, 30, scenes.metadata())
-    result = rollout(baseline(time * DT), other, 30, scenes.metadata())
+    expected = rollout(baseline(DT), start, 30, SCENE)
+    result = rollout(baseline(time * DT), other, 30, replace(SCENE, frame_dt=time * DT))
     np.testing.assert_allclose(result.pos / length, expected.pos, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(expected.pos[-1, 1:3], pos[1:3])
     if baseline is Ballistic:

@@ -46,6 +46,30 @@ def spoiled(key: str, node: int, value: float) -> Callable[[State], State]:
     return spoil
 
 
+@pytest.mark.parametrize(
+    "wrap", [lambda dt: Contained(FreeFall(dt), 2 * dt), lambda dt: Contained(FreeFall(2 * dt), dt), lambda dt: FreeFall(2 * dt)]
+)
+def test_wrappers_and_baselines_have_the_frame_interval_of_the_scene(wrap: Callable[[float], Simulator], trajectory: Trajectory) -> None:
+    dt = trajectory.metadata.frame_dt
+    stop = rollout(wrap(dt), trajectory.state(0), 3, trajectory.metadata).termination
+    assert stop is not None and stop.reason == "input"
+    assert f"has frame_dt = {2 * dt:g} s, the scene {dt:g} s; both must be the same" in stop.message
+    ensemble = Ensemble((Contained(FreeFall(dt), dt), Contained(FreeFall(dt), 2 * dt)))
+    stop = rollout(ensemble, trajectory.state(0), 3, trajectory.metadata).termination
+    assert stop is not None and stop.message.startswith("Contained has frame_dt")
+
+
+def test_a_result_has_the_gravity_of_its_start(trajectory: Trajectory) -> None:
+    start, metadata = trajectory.state(0), trajectory.metadata
+    assert rollout(FreeFall(metadata.frame_dt), start, 2, metadata).metadata is metadata
+    moon = np.asarray(metadata.gravity) / 6
+    for gravity in (moon, torch.from_numpy(moon)):
+        result = rollout(FreeFall(metadata.frame_dt), replace(start, gravity=moon), 2, metadata)
+        assert result.metadata == replace(metadata, gravity=tuple(np.asarray(gravity).tolist()))
+    stop = rollout(FreeFall(metadata.frame_dt), replace(start, gravity=np.zeros(5)), 2, metadata).termination
+    assert stop is not None and "gravity has the shape (5,)" in stop.message
+
+
 def test_oracle(trajectory: Trajectory) -> None:
     replay = Replay(trajectory)
     assert isinstance(replay, Simulator)

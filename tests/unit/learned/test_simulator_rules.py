@@ -1,0 +1,30 @@
+"""Simulators refuse precisions and ensembles in which their answers would be wrong."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gpe_pl.learned.checkpoint_file import CheckpointError
+from gpe_pl.learned.ensemble import LearnedEnsemble
+from gpe_pl.learned.simulator import LearnedSimulator, PrecisionError
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_refused_and_changes_nothing(dtype: torch.dtype) -> None:
+    simulator = LearnedSimulator.from_checkpoint("sand")
+    before = {name: values.clone() for name, values in simulator.state_dict().items()}
+    with pytest.raises(PrecisionError, match=f"{dtype}: a simulator computes in float32 or float64"):
+        simulator.to(dtype)
+    after = simulator.state_dict()
+    assert all(torch.equal(values, after[name]) and values.dtype == after[name].dtype for name, values in before.items())
+    assert next(simulator.double().model.parameters()).dtype == torch.float64
+
+
+def test_members_of_an_ensemble_fit_each_other() -> None:
+    sand, snow = (LearnedSimulator.from_checkpoint(name) for name in ("sand", "snow"))
+    with pytest.raises(CheckpointError, match="an ensemble needs at least one model"):
+        LearnedEnsemble(())
+    with pytest.raises(CheckpointError, match="member 1 has other materials, frames, spacing or history than member 0"):
+        LearnedEnsemble((sand, snow))
+    assert len(LearnedEnsemble((sand, sand)).members) == 2
