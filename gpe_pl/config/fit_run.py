@@ -112,9 +112,10 @@ class FitRun:
             )
 
     def prepare_data(self) -> None:
-        """Generate missing data and controls, after checking that noise and evaluation fit the scenes, and ``start_from`` the model. Choose the device.
+        """Generate missing data and controls, after checking that model, noise and evaluation fit the scenes, and ``start_from`` the model. Choose the device.
 
         Raises:
+            GpeError: the model refuses its settings for the materials of the scenes.
             NoiseError: the noise is too large for the spacing of the scenes.
             CheckpointError: the model of ``start_from`` has other settings.
             StartError: ``evaluation.start_time`` leaves too little history, or is between frames.
@@ -122,9 +123,10 @@ class FitRun:
         """
         scenes, evaluated = scene_metadata(self.parts[0], "train"), evaluated_config(self.cfg)
         self.training.noise.check(scenes)
+        builder = GraphBuilder(self.graph, scenes)
+        untrained = LearnedSimulator(self.new_model(spec=builder.spec), builder, self.stride)
         if self.start is not None:
-            builder = GraphBuilder(self.graph, scenes)
-            check_model(LearnedSimulator(self.new_model(spec=builder.spec), builder, self.stride), self.start)
+            check_model(untrained, self.start)
             stride = self.start.stride_on(scene_metadata(self.cfg, "train", strided=False))
             if stride and stride != self.stride:
                 log.warning("start_from: data.stride=%d has frames as long as those of the trained model", stride)
@@ -132,6 +134,7 @@ class FitRun:
         self.first_frame = self.evaluation.first_frame(self.graph.history, rolled_out.frame_dt)
         if self.cfg.evaluation.data and self.graph.scales == "one":
             check_same_frames(scenes, rolled_out)
+        self.solver = self._solver_of_targets()
         self.root, *others = (ensure_data(part) for part in self.parts)
         self.others = list(zip(others, map(stride_of, self.parts[1:]), strict=True))
         is_same = not self.cfg.evaluation.data and len(self.parts) == 1
@@ -263,7 +266,7 @@ class FitRun:
             self.trainer.num_workers,
             stress=bool(self.cfg.model.get("stress", False)),
             sampling=self.training.sampling,
-            solver=self._solver,
+            solver=self.solver,
             augmentation=self.training.augmentation,
             stride=self.stride,
             unroll_steps=self.training.unroll_steps or 1,
@@ -271,8 +274,7 @@ class FitRun:
             reads_relief=bool(self.cfg.model.get("wall_layer", 0)),
         )
 
-    @property
-    def _solver(self) -> Restartable | None:
+    def _solver_of_targets(self) -> Restartable | None:
         """Solver that gives training targets, with frames as long as the model's; None if ``training.targets`` is ``trajectory``."""
         if self.training.targets == "trajectory":
             return None

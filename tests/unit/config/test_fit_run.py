@@ -8,8 +8,13 @@ from typing import Any
 
 import pytest
 
+from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.config.fit_run import FitRun
+from gpe_pl.errors import GpeError
 from gpe_pl.files.run_folder import RunError, claim
+from gpe_pl.models.gpe import StressError
+from gpe_pl.nn.elastic_bodies import CellError
+from tests.runs import tiny
 
 
 @pytest.mark.parametrize(("budget", "is_explained"), [(1.0, True), (None, False)])
@@ -22,3 +27,24 @@ def test_a_number_of_steps_that_follows_from_a_budget_is_explained(tmp_path: Pat
     with pytest.raises(RunError, match=r"training.num_steps: 118 there, 126 now") as caught:
         run.claim_folder()
     assert ("follows from training.budget_minutes and the measured time of a step" in str(caught.value)) == is_explained
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error", "message"),
+    [
+        (
+            ("law=elastic", "model=gpe"),
+            CellError,
+            r"model\.elastic=true needs .* a material with cells, such as elastomer; the data set has sand",
+        ),
+        (("model=gpe", "model.stress=true"), StressError, r"model\.stress=true: the data set stores no stress of sand"),
+        (("data=sand", "training.targets=solver"), ConfigError, "the solver mpm cannot continue sand from positions"),
+    ],
+)
+def test_a_model_that_does_not_fit_the_materials_is_refused_before_data_are_generated(
+    overrides: tuple[str, ...], error: type[GpeError], message: str, tmp_path: Path
+) -> None:
+    run = FitRun(tiny(tmp_path / "data", tmp_path / "runs", *overrides), tmp_path / "run")
+    with pytest.raises(error, match=message):
+        run.prepare_data()
+    assert not [*tmp_path.iterdir()]
