@@ -72,8 +72,8 @@ def test_motion_of_the_scene_is_found_too(wanted: list[str]) -> None:
     if "gravity" in wanted:
         down = np.array([math.tan(math.radians(10.0)), -1.0])
         tilted = replace(seen.metadata, gravity=tuple(9.81 * down / np.linalg.norm(down)))
-        moved = rollout(Drag(), replace(seen.state(0), gravity=np.array(tilted.gravity)), 39, seen.metadata)
-        answer = identify_parameters(Drag(), moved, wanted, bounds=BOUNDS, search_settings=settings)
+        moved = rollout(Drag(), replace(seen.state(0), gravity=np.array(tilted.gravity)), 39, tilted)
+        answer = identify_parameters(Drag(), replace(moved, metadata=seen.metadata), wanted, bounds=BOUNDS, search_settings=settings)
         assert answer["gravity.x"].estimate == pytest.approx(10.0, abs=1.0)
     else:
         answer = identify_parameters(Drag(), seen, wanted, bounds=BOUNDS, search_settings=settings)
