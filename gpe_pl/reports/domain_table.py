@@ -22,7 +22,7 @@ from gpe_pl.evaluation.horizons import time_of
 from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.files.markdown import table_row
-from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means
+from gpe_pl.metrics import Interval, bootstrap_interval, median_of_means
 from gpe_pl.reports.finished_runs import (
     STAND_IN,
     Run,
@@ -38,6 +38,7 @@ from gpe_pl.reports.finished_runs import (
 )
 from gpe_pl.reports.material_table import FEWEST_SCENES, MATERIALS_FIGURE, material_lines, write_material_figure
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
+from gpe_pl.reports.ratio_table import FEWEST_SEEDS, ratio_text
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.viz.saving import save_figure
 
@@ -46,8 +47,6 @@ log = logging.getLogger(__name__)
 TABLE_CSV, TABLE_MD, RATIOS_MD, FIGURE = "table1.csv", "table1.md", "table1_ratios.md", "table1.png"
 TABLES = (TABLE_CSV, TABLE_MD, RATIOS_MD, FIGURE, PARAMETER_FIGURE, MATERIALS_FIGURE)
 OWN = "GPE"
-FEWEST_SEEDS = 2
-"""Training seeds of each model that a significant ratio needs. One seed says nothing about the spread between seeds."""
 NOT_LEARNED = 2.0
 """A model has learned only if its error is at least this many times lower than that of the best trivial baseline."""
 
@@ -315,10 +314,7 @@ def _ratio(cells: dict[str, Cell]) -> str:
     if not baselines:
         return "no baseline learned" if own.is_learned else "no model learned"
     best = min(baselines, key=lambda c: c.interval.estimate)
-    i = bootstrap_ratio(own.errors, best.errors, statistic=median_of_means)
-    enough = min(len(own.errors), len(best.errors)) >= FEWEST_SEEDS and own.errors.shape[1] >= FEWEST_SCENES
-    estimate = f"**{i.estimate:.2f}**" if enough and (i.low > 1 or i.high < 1) else f"{i.estimate:.2f}"
-    return f"{estimate} [{i.low:.2f}, {i.high:.2f}]" + ("" if own.is_learned else ", not learned")
+    return ratio_text(own.errors, best.errors, median_of_means) + ("" if own.is_learned else ", not learned")
 
 
 def _paper_ratio(domain: str) -> str:

@@ -42,6 +42,7 @@ from gpe_pl.reports.finished_runs import (
 from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, verdict, write_material_figure
 from gpe_pl.reports.outcome import outcomes
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
+from gpe_pl.reports.ratio_table import ratio_lines
 from gpe_pl.reports.stride_table import DIFFERENT_STARTS, STRIDES_MD, stride_lines
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.viz.coloring import MOST_CURVES
@@ -246,6 +247,7 @@ def _markdown(axes: list[str], variants: dict[Variant, list[Run]], ratios: dict[
             "",
             *_rollout_table(names, variants),
             *_different_starts(variants),
+            *ratio_lines(axes, variants, _horizons(run for runs in variants.values() for run in runs)),
             *_stress_table(names, variants),
             *_metric_table(names, variants, BODY_COLUMNS, BODY_NOTE),
             *_metric_table(names, variants, LIQUID_COLUMNS, LIQUID_NOTE),
