@@ -374,7 +374,7 @@ def generate_trajectory(
     Args:
         spec: the data set.
         split, index: split and number of the trajectory.
-        values: other parameters of each material, as in ``initial_state``.
+        values: other parameters of each material, as in ``initial_state``. The split and the parameter group of the metadata stay those of the data set.
         num_frames: number of frames, the initial one included; None takes that of the data set.
 
     Raises:
