@@ -16,42 +16,40 @@ NUM_BISECTIONS = 30
 
 
 @dataclass(frozen=True)
-class ConstantVelocity:
-    """Every node keeps its velocity, and every rigid body its momentum and angular momentum; walls are ignored.
+class _Baseline:
+    """A baseline of any scene.
 
     Attributes:
         dt: frame interval [s].
     """
 
     dt: float
+
+    @property
+    def frame_dt(self) -> float:
+        """Frame interval [s], which that of a scene has to be."""
+        return self.dt
+
+
+@dataclass(frozen=True)
+class ConstantVelocity(_Baseline):
+    """Every node keeps its velocity, and every rigid body its momentum and angular momentum; walls are ignored."""
 
     def step(self, state: State) -> State:
         return moved_rigidly(state, state.later(self.dt, state.pos + state.vel * self.dt, state.vel), self.dt)
 
 
 @dataclass(frozen=True)
-class StopsAtWalls:
-    """Every node keeps its velocity until it touches a wall or obstacle, where it sticks. This baseline also suits data whose gravity is unknown.
-
-    Attributes:
-        dt: frame interval [s].
-    """
-
-    dt: float
+class StopsAtWalls(_Baseline):
+    """Every node keeps its velocity until it touches a wall or obstacle, where it sticks. This baseline also suits data whose gravity is unknown."""
 
     def step(self, state: State) -> State:
         return _sticking(state, self.dt, 0.0 * state.gravity)
 
 
 @dataclass(frozen=True)
-class Ballistic:
-    """Every node falls freely until it touches a wall or obstacle, where it sticks.
-
-    Attributes:
-        dt: frame interval [s].
-    """
-
-    dt: float
+class Ballistic(_Baseline):
+    """Every node falls freely until it touches a wall or obstacle, where it sticks."""
 
     def step(self, state: State) -> State:
         return _sticking(state, self.dt, state.gravity)

@@ -175,6 +175,11 @@ class Contained:
                 "Ensemble(tuple(Contained(member, dt) for member in ensemble.members))"
             )
 
+    @property
+    def frame_dt(self) -> float:
+        """Frame interval [s], which that of a scene has to be."""
+        return self.dt
+
     def step(self, state: State) -> State:
         return self._contain(self.simulator.step(state))
 

@@ -126,7 +126,7 @@ class GroundTruth(Protocol):
 def unfit(simulator: Simulator, metadata: Metadata) -> Termination | None:
     """Return the reason why a simulator cannot compute a scene: another frame interval, or a solver for other materials. None means that it can."""
     for layer in _layers(simulator):
-        frame_dt = getattr(layer, "frame_dt", getattr(layer, "dt", metadata.frame_dt))
+        frame_dt = getattr(layer, "frame_dt", metadata.frame_dt)
         if not math.isclose(frame_dt, metadata.frame_dt, rel_tol=1e-6):
             return _unlike(f"{_named(layer)} has frame_dt = {frame_dt:g} s, the scene {metadata.frame_dt:g} s")
     if isinstance(simulator, GroundTruth) and tuple(simulator.materials) != metadata.materials:
@@ -146,7 +146,7 @@ def _layers(simulator: Any) -> Iterator[Any]:
 def _named(simulator: Any) -> str:
     if isinstance(simulator, GroundTruth):
         return f"the solver {simulator.name}"
-    return "the model" if hasattr(simulator, "frame_dt") else type(simulator).__name__
+    return type(simulator).__name__ if hasattr(simulator, "simulator") else "the model"
 
 
 def _unlike(difference: str) -> Termination:

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from gpe_pl.geometry.shapes import Box
+from gpe_pl.rollout.baselines import Ballistic
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.ensemble import Ensemble
 from gpe_pl.rollout.guard import Guard, _depth_through
@@ -47,7 +48,7 @@ def spoiled(key: str, node: int, value: float) -> Callable[[State], State]:
 
 
 @pytest.mark.parametrize(
-    "wrap", [lambda dt: Contained(FreeFall(dt), 2 * dt), lambda dt: Contained(FreeFall(2 * dt), dt), lambda dt: FreeFall(2 * dt)]
+    "wrap", [lambda dt: Contained(FreeFall(dt), 2 * dt), lambda dt: Contained(Ballistic(2 * dt), dt), lambda dt: Ballistic(2 * dt)]
 )
 def test_wrappers_and_baselines_have_the_frame_interval_of_the_scene(wrap: Callable[[float], Simulator], trajectory: Trajectory) -> None:
     dt = trajectory.metadata.frame_dt
