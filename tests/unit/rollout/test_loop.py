@@ -64,9 +64,10 @@ def test_a_result_has_the_gravity_of_its_start(trajectory: Trajectory) -> None:
     start, metadata = trajectory.state(0), trajectory.metadata
     assert rollout(FreeFall(metadata.frame_dt), start, 2, metadata).metadata is metadata
     moon = np.asarray(metadata.gravity) / 6
-    for gravity in (moon, torch.from_numpy(moon)):
-        result = rollout(FreeFall(metadata.frame_dt), replace(start, gravity=moon), 2, metadata)
-        assert result.metadata == replace(metadata, gravity=tuple(np.asarray(gravity).tolist()))
+    arrays = replace(start, gravity=moon)
+    for first in (arrays, arrays.to_torch()):
+        result = rollout(FreeFall(metadata.frame_dt), first, 2, metadata)
+        assert result.metadata == replace(metadata, gravity=tuple(moon.tolist()))
     stop = rollout(FreeFall(metadata.frame_dt), replace(start, gravity=np.zeros(5)), 2, metadata).termination
     assert stop is not None and "gravity has the shape (5,)" in stop.message
 
