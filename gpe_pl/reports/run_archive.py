@@ -1,14 +1,15 @@
 """Archive of many runs: two small files from which tables can be made again after the folders of the runs are deleted.
 
-``runs.json`` has the configurations and validation curves. ``rollouts.csv.xz`` has one line per run, model, split and trajectory, and one column per metric and
-horizon, such as ``rollout_mse@full``. Values have six significant digits; metrics
-of single-precision rollouts have no more.
+``runs.json`` has the configurations and validation curves. Values that all or several runs have are said once.
+``rollouts.csv.xz`` has one line per run, model, split and trajectory, and one column per metric and horizon, such as ``rollout_mse@full``. Values have six
+significant digits; metrics of single-precision rollouts have no more.
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
+import json
 import lzma
 from pathlib import Path
 from typing import Any
@@ -50,9 +51,7 @@ def write_archive(folder: Path, runs: dict[str, dict[str, Any]], rows: dict[str,
     content = lzma.compress(wide.to_csv(index=False, lineterminator="\n").encode())
     with replacing(folder / ROLLOUTS) as part:
         part.write_bytes(content)
-    common = {key: value for key, value in next(iter(runs.values())).items() if all(run.get(key) == value for run in runs.values())}
-    own = {name: {key: value for key, value in run.items() if key not in common} for name, run in runs.items()}
-    sealed.write(folder / RUNS, {"common": common, "runs": own, CONTENT: hashlib.sha256(content).hexdigest()})
+    sealed.write(folder / RUNS, {**_said_once(runs), CONTENT: hashlib.sha256(content).hexdigest()})
 
 
 def read_archive(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, pd.DataFrame]]:
@@ -77,7 +76,27 @@ def read_archive(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, pd.
         raise ArchiveError(f"{folder / ROLLOUTS}: unpacks to more than {MOST_BYTES} bytes; {advice}")
     wide = pd.read_csv(io.BytesIO(unpacked), dtype=str, keep_default_na=False)
     runs = {name: {**about["common"], **own} for name, own in about["runs"].items()}
+    for group in about.get("shared", []):  # earlier archives have none
+        for name in group["runs"]:
+            runs[name].update(group["values"])
     return runs, {name: _long(table) for name, table in wide.groupby("run")}
+
+
+def _said_once(runs: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return ``common`` values of all runs, ``shared`` ones with the names of the runs that have them, and each run's own ones."""
+    owners: dict[tuple[str, str], list[str]] = {}
+    values: dict[tuple[str, str], Any] = {}
+    for name, run in runs.items():
+        for key, value in run.items():
+            entry = key, json.dumps(value, sort_keys=True)
+            owners.setdefault(entry, []).append(name)
+            values[entry] = value
+    groups: dict[tuple[str, ...], dict[str, Any]] = {}
+    for entry, names in owners.items():
+        groups.setdefault(tuple(names), {})[entry[0]] = values[entry]
+    common = groups.pop(tuple(runs), {})
+    own = {name: groups.pop((name,), {}) for name in runs}
+    return {"common": common, "shared": [{"runs": list(names), "values": group} for names, group in groups.items()], "runs": own}
 
 
 def _long(wide: pd.DataFrame) -> pd.DataFrame:

@@ -71,6 +71,25 @@ def test_an_archive_that_unpacks_to_gigabytes_is_refused(archived: Path, monkeyp
         finished_runs(archived)
 
 
+def test_what_several_runs_share_is_said_once_and_read_for_each(tmp_path: Path) -> None:
+    runs = {"a": {"all": 1, "some": [1, 2]}, "b": {"all": 1, "some": [1, 2], "one": None}, "c": {"all": 1, "some": [2]}}
+    rows = pd.DataFrame([["learned", "test", 0, "", np.nan, "x", "full", 1.0]], columns=COLUMNS)
+    write_archive(tmp_path, runs, dict.fromkeys(runs, rows))
+    about = json.loads((tmp_path / RUNS).read_text())
+    assert about["shared"] == [{"runs": ["a", "b"], "values": {"some": [1, 2]}}]
+    assert about["common"] == {"all": 1} and about["runs"] == {"a": {}, "b": {"one": None}, "c": {"some": [2]}}
+    assert read_archive(tmp_path)[0] == runs
+
+
+def test_an_archive_without_shared_values_is_read(archived: Path) -> None:
+    """Archives of earlier versions repeat what several runs share."""
+    about = json.loads((archived / RUNS).read_text())
+    expected = read_archive(archived)[0]
+    del about["shared"], about[sealed.SEAL]
+    sealed.write(archived / RUNS, about)
+    assert read_archive(archived)[0] == expected
+
+
 def test_what_runs_have_in_common_is_said_once(archived: Path) -> None:
     about = json.loads((archived / RUNS).read_text())
     assert sealed.SEAL in about
