@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, field, replace
 from pathlib import Path
@@ -105,6 +106,12 @@ class ValueGroups:
             raise ValueError(
                 f"interpolated values must lie inside and extrapolated ones outside the range [{low}, {high}] of the seen ones"
             )
+
+    def group(self, value: float) -> ParameterGroup:
+        """Return the group of any value of the parameter. A value between seen ones is interpolated, also where ``interpolated`` does not list it."""
+        if any(math.isclose(value, known, rel_tol=1e-6) for known in self.seen):  # to single precision, in which values are stored
+            return "seen"
+        return "interpolated" if min(self.seen) < value < max(self.seen) else "extrapolated"
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
@@ -326,6 +333,17 @@ def named_values(spec: DatasetSpec, values: Mapping[str, MaterialValues]) -> dic
     return named
 
 
+def group_of(spec: DatasetSpec, values: Mapping[str, MaterialValues]) -> ParameterGroup:
+    """Return the parameter group of a scene with these values: that of the value farthest from training.
+
+    Raises:
+        ValueError: a stored parameter is missing, or another one is named.
+    """
+    named = named_values(spec, values)
+    found = {known.group(named[m][parameter.name]) for m, design in spec.parameters.items() for parameter, _, known in design.of(m)}
+    return next(group for group in ("extrapolated", "interpolated", "seen") if group in found)  # type: ignore[return-value]
+
+
 def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
     """Return the metadata of one trajectory."""
     return describe(
@@ -374,7 +392,8 @@ def generate_trajectory(
     Args:
         spec: the data set.
         split, index: split and number of the trajectory.
-        values: other parameters of each material, as in ``initial_state``. The split and the parameter group of the metadata stay those of the data set.
+        values: other parameters of each material, as in ``initial_state``. The parameter group of the metadata is that of these values; the split stays that
+            of the scene.
         num_frames: number of frames, the initial one included; None takes that of the data set.
 
     Raises:
@@ -383,6 +402,8 @@ def generate_trajectory(
     metadata = trajectory_metadata(spec, split, index)
     label = f"split {split}, index {index}, seed {metadata.seed}"
     state = initial_state(spec, split, index, values)
+    if values:
+        metadata = replace(metadata, parameter_group=group_of(spec, values))
     guard = Guard(bounds=spec.scene.bounds, margin=ON_SURFACE * max(high - low for low, high in spec.scene.bounds))
     trajectory = rollout(spec.label_solver, state, (num_frames or spec.num_frames) - 1, metadata, guard)
     if trajectory.termination is not None:

@@ -1,11 +1,13 @@
-"""A trajectory that cannot be simulated is refused, with the reason."""
+"""A trajectory that cannot be simulated is refused, with the reason; one with other parameters is labelled by them."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import pytest
 
 from gpe_pl.config.datasets import dataset
-from gpe_pl.data.ground_truth import GenerationError, generate_trajectory
+from gpe_pl.data.ground_truth import GenerationError, ParameterValues, ValueGroups, generate_trajectory, group_of
 
 SPEC = dataset("data=sand", "size=tiny")
 
@@ -25,3 +27,27 @@ def test_a_trajectory_has_a_split_and_a_number(split: str, index: int, message: 
 def test_no_advice_for_the_solver_is_given_against_a_refused_parameter() -> None:
     with pytest.raises(GenerationError, match=r"friction_angle of sand is 95 deg, outside 0 … 60, the limits of the solvers$"):
         generate_trajectory(SPEC, "test", 0, values={"sand": 95.0}, num_frames=3)
+
+
+@pytest.mark.parametrize("split", ["test", "test_unseen"])
+@pytest.mark.parametrize(
+    ("angle", "group"), [(20.0, "seen"), (20.000001, "seen"), (21.0, "interpolated"), (19.0, "extrapolated"), (50.0, "extrapolated")]
+)
+def test_a_trajectory_has_the_group_of_the_values_that_it_was_given(split: str, angle: float, group: str) -> None:
+    spec = replace(SPEC, parameters={"sand": ParameterValues((20.0, 30.0, 40.0), (25.0,), (15.0,))})
+    metadata = generate_trajectory(spec, split, 0, values={"sand": angle}, num_frames=3).metadata
+    assert (metadata.split, metadata.parameter_group) == (split, group)
+
+
+def test_the_group_of_several_parameters_is_that_of_the_one_farthest_from_training() -> None:
+    further = {"cohesion": ValueGroups((0.0, 500.0))}
+    spec = replace(SPEC, parameters={"sand": ParameterValues((20.0, 40.0), (25.0,), (15.0,), further=further)})
+    expected = {
+        (20.0, 0.0): "seen",
+        (20.0, 250.0): "interpolated",
+        (30.0, 500.0): "interpolated",
+        (30.0, 501.0): "extrapolated",
+        (15.0, 0.0): "extrapolated",
+    }
+    for (angle, cohesion), group in expected.items():
+        assert group_of(spec, {"sand": {"friction_angle": angle, "cohesion": cohesion}}) == group
