@@ -146,6 +146,11 @@ class LearnedSimulator(nn.Module):
         """Frame interval [s]."""
         return self.builder.metadata.frame_dt
 
+    @property
+    def spacing(self) -> float:
+        """Rest spacing of nodes [m]."""
+        return self.builder.metadata.spacing
+
     def configured(self, **settings: Unpack[RolloutSettings]) -> LearnedSimulator:
         """Return a copy with other settings; None keeps a setting. The copy shares the weights and leaves this simulator unchanged."""
         other = copy.copy(self)

@@ -68,6 +68,10 @@ class SimulationError(GpeError, RuntimeError):
         self.reason, self.node = reason, node
 
 
+SCALES = (("frame_dt", "s", 1e-6), ("spacing", "m", 0.01))
+"""Attributes that a simulator may have, and that are then those of the scene's metadata: name, unit and relative tolerance."""
+
+
 @dataclass(frozen=True)
 class Replay:
     """A simulator that returns the frames of a stored trajectory, chosen by the time of the state. After the last frame, ``step`` raises ``IndexError``.
@@ -124,11 +128,12 @@ class GroundTruth(Protocol):
 
 
 def unfit(simulator: Simulator, metadata: Metadata) -> Termination | None:
-    """Return the reason why a simulator cannot compute a scene: another frame interval, or a solver for other materials. None means that it can."""
+    """Return the reason why a simulator cannot compute a scene: another frame interval or spacing, or a solver for other materials. None means that it can."""
     for layer in _layers(simulator):
-        frame_dt = getattr(layer, "frame_dt", metadata.frame_dt)
-        if not math.isclose(frame_dt, metadata.frame_dt, rel_tol=1e-6):
-            return _unlike(f"{_named(layer)} has frame_dt = {frame_dt:g} s, the scene {metadata.frame_dt:g} s")
+        for name, unit, tolerance in SCALES:
+            own, there = getattr(layer, name, None), getattr(metadata, name)
+            if own is not None and not math.isclose(own, there, rel_tol=tolerance):
+                return _unlike(f"{_named(layer)} has {name} = {own:g} {unit}, the scene {there:g} {unit}")
     if isinstance(simulator, GroundTruth) and tuple(simulator.materials) != metadata.materials:
         own, there = ", ".join(simulator.materials), ", ".join(metadata.materials)
         return _unlike(f"{_named(simulator)} has the materials {own}, the scene {there}, in this order")

@@ -102,6 +102,21 @@ def test_a_model_of_other_frames_than_the_scene_is_refused(trajectory: Trajector
     assert rollout(wrapped(Paced(dt)), trajectory.state(0), 2, trajectory.metadata).num_frames == 3
 
 
+@dataclass(frozen=True)
+class Spaced(FreeFall):
+    """A model that knows its spacing."""
+
+    spacing: float = 0.0
+
+
+def test_a_model_of_another_spacing_than_the_scene_is_refused(trajectory: Trajectory) -> None:
+    dt, spacing = trajectory.metadata.frame_dt, trajectory.metadata.spacing
+    stop = rollout(Contained(Spaced(dt, spacing=2 * spacing), dt), trajectory.state(0), 2, trajectory.metadata).termination
+    assert stop is not None and (stop.reason, stop.frame) == ("input", 0)
+    assert f"the model has spacing = {2 * spacing:g} m, the scene {spacing:g} m; both must be the same" in stop.message
+    assert rollout(Spaced(dt, spacing=1.005 * spacing), trajectory.state(0), 2, trajectory.metadata).num_frames == 3
+
+
 def test_oracle_survives_hundreds_of_inexact_time_steps(new_trajectory: New) -> None:
     long = new_trajectory(num_frames=700, num_nodes=1, frame_dt=1 / 3)
     np.testing.assert_array_equal(rollout(Replay(long), long.state(0), 699, long.metadata).pos, long.pos)
