@@ -110,6 +110,16 @@ def test_a_network_that_knows_the_numbers_of_its_nodes_is_found_out(spec: Datase
     assert record["status"] == "failed"
 
 
+def test_the_jump_at_the_radius_is_also_told_without_island_momentum(spec: DatasetSpec, scenes: list[Trajectory]) -> None:
+    exact, plain = subject(spec, scenes, **SHIPPED), subject(spec, scenes, edge_state="geometry")
+    own, cause = geometry.cutoff(exact).measured.split(" one-step RMSE; ")
+    assert cause.endswith(" without island momentum") and float(own) != float(cause.split()[0])
+    alone = geometry.cutoff(plain).measured
+    assert alone.endswith(" one-step RMSE")  # the same weights
+    assert float(cause.split()[0]) * exact.one_step_rmse == pytest.approx(float(alone.split()[0]) * plain.one_step_rmse, rel=0.1)
+    assert exact.simulator.model.settings["island_momentum"] == "angular"
+
+
 def test_a_model_without_exact_momentum_says_so(spec: DatasetSpec, scenes: list[Trajectory]) -> None:
     own = subject(spec, scenes)
     assert conservation.linear_momentum(own).passed is None
