@@ -1,4 +1,4 @@
-"""Stress tests of positions: coincident, isolated and crowded nodes, a node that crosses the connectivity radius, and neighbour lists against brute force."""
+"""Stress tests of positions: coincident, isolated and crowded nodes, a node that crosses the radius, an edge that turns, and neighbour lists by brute force."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from gpe_pl.trajectory.state import State
 
 NUM_MOVES = 1000
 NUM_CROWDED = 20_000
+NUM_EDGES = 8
 
 
 def has_finite_gradients(subject: Subject, state: State) -> bool:
@@ -130,6 +131,26 @@ def _without_islands(simulator: LearnedSimulator) -> LearnedSimulator:
     return other
 
 
+@stress_test(31, "an edge turns", "a node passes above or below a neighbour: no acceleration jumps by more than the one-step RMSE")
+def turning_edge(subject: Subject) -> Outcome:
+    """A message of the kind ``negated`` depends on which end is to the right (``momentum_conv.orient``), so it may jump where this changes."""
+    state, radius = subject.state(), subject.simulator.builder.scales.radius
+    pairs = radius_pairs(state.pos.numpy(), radius)
+    if len(pairs.T) == 0:
+        return inapplicable("no two nodes of the scene are within the radius")
+    apart = (state.pos[pairs[0], 0] - state.pos[pairs[1], 0]).abs()
+    jumps = []
+    for fixed, passing in pairs.T[torch.argsort(apart)[:NUM_EDGES].numpy()].tolist():
+        sides = []
+        for offset in (1e-9 * radius, -1e-9 * radius):
+            pos = state.pos.clone()
+            pos[passing, 0] = pos[fixed, 0] + offset
+            sides.append(acceleration(subject.simulator, replace(state, pos=pos)))
+        jumps.append(float((sides[1] - sides[0]).abs().max()))
+    jump = largest(jumps) / subject.one_step_rmse
+    return Outcome(jump < 1, f"{jump:.2g} one-step RMSE, largest of {len(jumps)} edges")
+
+
 @stress_test(16, "neighbour list", "equal to brute force for 1,000 random moves; pairs are unordered")
 def neighbour_list(subject: Subject) -> Outcome:
     rng = np.random.default_rng(0)
@@ -144,4 +165,4 @@ def neighbour_list(subject: Subject) -> Outcome:
     return Outcome(wrong == 0, f"{wrong} pairs differ; there is no skin: every step searches anew")
 
 
-TESTS = (coincident, isolated, density_spike, cutoff, neighbour_list)
+TESTS = (coincident, isolated, density_spike, cutoff, turning_edge, neighbour_list)

@@ -84,7 +84,7 @@ class Settings:
     num_scenes: Annotated[int, Field(ge=1)] = 5
     horizon_factors: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1)] = field(default_factory=lambda: [1.0, 3.0, 10.0])
     num_rest_steps: Annotated[int, Field(ge=1)] = 1000
-    tests: list[Annotated[int, Field(ge=1, le=30)]] = field(default_factory=list)
+    tests: list[Annotated[int, Field(ge=1, le=31)]] = field(default_factory=list)
     num_workers: Annotated[int, Field(ge=1)] = 2
     num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
 

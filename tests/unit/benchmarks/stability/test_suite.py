@@ -58,8 +58,8 @@ def subject(spec: DatasetSpec, scenes: list[Trajectory], **settings: str) -> Sub
     return Subject("GPE", "sand", simulator, spec, scenes, max_speed=10.0, is_gating=True, horizon_factors=(1.0, 2.0), num_rest_steps=5)
 
 
-def test_all_thirty_tests_are_there_once() -> None:
-    assert sorted(t.number for tests in GROUPS.values() for t in tests) == list(range(1, 31))
+def test_all_tests_are_there_once() -> None:
+    assert sorted(t.number for tests in GROUPS.values() for t in tests) == list(range(1, 32))
     assert all(t.criterion and t.name for tests in GROUPS.values() for t in tests)
 
 
@@ -118,6 +118,14 @@ def test_the_jump_at_the_radius_is_also_told_without_island_momentum(spec: Datas
     assert alone.endswith(" one-step RMSE")  # the same weights
     assert float(cause.split()[0]) * exact.one_step_rmse == pytest.approx(float(alone.split()[0]) * plain.one_step_rmse, rel=0.1)
     assert exact.simulator.model.settings["island_momentum"] == "angular"
+
+
+@pytest.mark.parametrize(("interaction", "jumps"), [("negated", True), ("odd", False), ("odd_even", False), ("directed", False)])
+def test_only_negated_messages_jump_where_an_edge_turns(spec: DatasetSpec, scenes: list[Trajectory], interaction: str, jumps: bool) -> None:
+    outcome = geometry.turning_edge(subject(spec, scenes, interaction=interaction))
+    jump = float(outcome.measured.split()[0])
+    assert outcome.measured.endswith("one-step RMSE, largest of 8 edges") and outcome.passed is (jump < 1)
+    assert (jump > 1e-4) is jumps, outcome.measured
 
 
 def test_a_model_without_exact_momentum_says_so(spec: DatasetSpec, scenes: list[Trajectory]) -> None:
