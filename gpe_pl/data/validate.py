@@ -407,7 +407,8 @@ Schema version {version}. There is one HDF5 file per shard and one group per tra
     attributes: schema_version, units (JSON), num_trajectories
     00000/  00001/  …                      one trajectory each
         attributes: metadata (JSON), shapes (JSON), node_types (JSON), sha256; start_time (JSON, s) if the trajectory begins later than
-                    its scene; openings (JSON) if the scene has inlets and outlets; prediction if a model predicted it
+                    its scene; openings (JSON) if the scene has inlets and outlets; termination (JSON) if it is a
+                    rollout that stopped early; prediction if a model predicted it
         pos  vel  …                        fields, each with an attribute unit
 ```
 

@@ -245,5 +245,7 @@ def _fraction_outside(prediction: Trajectory, first: int, last: int, tolerance: 
         first, last: frames.
         tolerance: depth [m] up to which a particle is not counted.
     """
+    if first >= prediction.num_frames:
+        return 1.0
     wanted, good = last - first + 1, prediction.frames(first, last + 1)
     return (fraction_outside(good, tolerance) * good.num_frames + wanted - good.num_frames) / wanted

@@ -76,8 +76,8 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
         stride: step between written frames.
 
     Raises:
-        ValueError: the file type is wrong, the stride is not positive, the ground truth has other nodes or fewer frames, a cell has no known kind, or an open
-            scene has a mesh.
+        ValueError: the file type is wrong, the stride is not positive, the ground truth has other nodes, fewer frames or another start, a cell has no known
+            kind, or an open scene has a mesh.
         FullDiskError: the disk is full; the written part of a new series is removed.
     """
     path = Path(path)
@@ -94,6 +94,11 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     if ground_truth is not None and not math.isclose(trajectory.metadata.frame_dt, ground_truth.metadata.frame_dt, rel_tol=1e-6):
         raise ValueError(
             f"{path}: frames are {trajectory.metadata.frame_dt:g} s long, those of the ground truth {ground_truth.metadata.frame_dt:g} s"
+        )
+    if ground_truth is not None and abs(trajectory.start_time - ground_truth.start_time) > 0.5 * ground_truth.metadata.frame_dt:
+        raise ValueError(
+            f"{path}: the trajectory begins at {trajectory.start_time:g} s, the ground truth at {ground_truth.start_time:g} s; "
+            "cut one of them (Trajectory.frames)"
         )
     if trajectory.alive is not None and trajectory.cells is not None:
         raise ValueError(f"{path}: meshes of open scenes are not written; write a NumPy archive")

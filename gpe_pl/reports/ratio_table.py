@@ -42,13 +42,14 @@ def ratio_lines(axes: Sequence[str], variants: dict[tuple[str, ...], list[Run]],
     for split in SPLITS:
         rows = [[*first, split, *["1" for _ in horizons]]]
         for key in others:
-            rows.append([*key, split, *(_cell(variants[key], variants[first], split, h) for h in horizons)])
+            rows.append([*key, split, *(ratio_cell(variants[key], variants[first], split, h) for h in horizons)])
         if any(cell != "–" for row in rows[1:] for cell in row[-len(horizons) :]):
             lines += map(table_row, rows)
     return ["", *lines, "", NOTE] if len(lines) > 2 else []
 
 
-def _cell(runs: list[Run], reference: list[Run], split: str, horizon: str) -> str:
+def ratio_cell(runs: list[Run], reference: list[Run], split: str, horizon: str) -> str:
+    """Return the ratio of the mean errors of two models over their common trajectories, with its interval; a dash if there are none."""
     own, other = (rollout_errors(of, split, horizon) for of in (runs, reference))
     shared = shared_trajectories(own, other)
     if not (own and other and shared):

@@ -16,7 +16,7 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.openings import Opening, openings_fault, openings_from_json, openings_to_json
 from gpe_pl.trajectory.state import Stress
-from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
 from gpe_pl.trajectory.values import faults, size_conflicts
 
 
@@ -126,9 +126,11 @@ START_TIME = "start_time"
 first frame is undeformed."""
 OPENINGS = "openings"
 """Name of the attribute with the inlets and outlets of an open scene."""
+TERMINATION = "termination"
+"""Name of the attribute with the reason why a rollout stopped early."""
 ATTRIBUTES = ("metadata", "shapes", "node_types")
 """Attributes of every trajectory's group, besides the digest."""
-FURTHER = (START_TIME, OPENINGS)
+FURTHER = (START_TIME, OPENINGS, TERMINATION)
 """Attributes that some trajectories have, and that the digest covers."""
 
 
@@ -138,7 +140,7 @@ OPTIONAL = ("stress_materials", "loads")
 
 def stored_attributes(trajectory: Trajectory) -> dict[str, str]:
     """Return the attributes of a trajectory as JSON: metadata, shapes of its boundary, names of the ``node_type`` codes, and, if there are some, a start time
-    other than 0 and openings.
+    other than 0, openings, and the reason why a rollout stopped.
     """
     m = trajectory.metadata
     values = {name: value for name, value in asdict(m).items() if name not in OPTIONAL or value is not None}
@@ -146,7 +148,8 @@ def stored_attributes(trajectory: Trajectory) -> dict[str, str]:
     shapes = json.dumps([shape_to_dict(s) for s in trajectory.boundary.shapes], sort_keys=True)
     begins = {START_TIME: repr(float(trajectory.start_time))} if trajectory.start_time else {}
     opens = {OPENINGS: openings_to_json(trajectory.openings)} if trajectory.openings else {}
-    return {"metadata": meta, "shapes": shapes, "node_types": json.dumps(NODE_TYPES), **begins, **opens}
+    ends = {TERMINATION: json.dumps(asdict(trajectory.termination), sort_keys=True)} if trajectory.termination else {}
+    return {"metadata": meta, "shapes": shapes, "node_types": json.dumps(NODE_TYPES), **begins, **opens, **ends}
 
 
 def digested_attributes(group: h5py.Group) -> dict[str, str]:
@@ -397,6 +400,22 @@ def start_time_of(group: h5py.Group) -> float:
     return float(seconds)
 
 
+def termination_of(group: h5py.Group) -> Termination | None:
+    """Return the reason why the rollout in a trajectory's group stopped; None if it did not."""
+    if TERMINATION not in group.attrs:
+        return None
+    try:
+        values = parsed(read_text(group, TERMINATION))
+        kinds = {"reason": str, "frame": int, "node": int, "message": str}
+        if not isinstance(values, dict) or {key: type(value) for key, value in values.items()} != kinds:
+            raise ValueError(f"must have {', '.join(kinds)}")
+    except StoreError:
+        raise
+    except ValueError as error:
+        raise StoreError(f"{_where(group)}: attribute {TERMINATION!r} is unreadable: {error}; {ADVICE}") from None
+    return Termination(**values)
+
+
 def openings_of(group: h5py.Group) -> tuple[Opening, ...]:
     """Return the inlets and outlets of a trajectory's group; their values are not checked."""
     if OPENINGS not in group.attrs:
@@ -430,16 +449,18 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         path: shard.
         name: group name.
         verify: recompute the SHA-256 digest. HDF5's checksums are always verified.
-        frames: read these frames only; not together with ``verify``.
+        frames: read these frames only; not together with ``verify``. ``Trajectory.every`` takes every so many frames.
 
     Raises:
-        StoreError: a file, group or field is missing, has the wrong shape or type, or does not match its checksum.
+        StoreError: a file, group, field or frame is missing, has the wrong shape or type, or does not match its checksum.
         UnsoundError: metadata, shapes or values break their rules (``Metadata.violations``, ``shape_values.shapes_fault``, ``schema.FIELDS``). The message
             names field, frame and node.
-        ValueError: ``verify`` and ``frames`` are given together.
+        ValueError: ``verify`` and ``frames`` are given together, or ``frames`` has a step.
     """
     if verify and frames is not None:
         raise ValueError("the digest covers all frames: pass verify or frames, not both")
+    if frames is not None and frames.step not in (None, 1):
+        raise ValueError(f"{frames} must not have a step; take every so many frames with Trajectory.every")
     with open_shard(path) as file:
         return trajectory_in(open_group(file, name), verify, frames)
 
@@ -448,7 +469,10 @@ def trajectory_in(group: h5py.Group, verify: bool = False, frames: slice | None 
     """Return the trajectory of an open group; arguments and errors are those of ``read_trajectory``."""
     metadata, where = metadata_of(group), _where(group)
     arrays = {key: read_field(group, key, frames) for key, spec in FIELDS.items() if spec.required or is_named(group, key)}
-    first_frame = 0 if frames is None else frames.indices(open_field(group, "pos").shape[0])[0]
+    num_frames = open_field(group, "pos").shape[0]
+    first_frame, last_frame, _ = slice(None).indices(num_frames) if frames is None else frames.indices(num_frames)
+    if first_frame >= last_frame and num_frames:
+        raise StoreError(f"{where}: has {num_frames} frames, and none of {frames}")
     if verify and digest(arrays, digested_attributes(group)) != read_text(group, "sha256"):
         raise StoreError(f"{where}: SHA-256 digest does not match the content; {ADVICE}")
     if ("node_stress" in arrays) != ("cell_stress" in arrays):
@@ -456,7 +480,7 @@ def trajectory_in(group: h5py.Group, verify: bool = False, frames: slice | None 
     for conflict in size_conflicts(arrays, metadata.dim, len(metadata.param_names)):
         raise StoreError(f"{where}: {conflict}; {ADVICE}")
     shapes, names, is_prediction, begins = shapes_of(group), node_types_of(group), PREDICTION in group.attrs, start_time_of(group)
-    openings = openings_of(group)
+    openings, end = openings_of(group), termination_of(group)
     for key, violation in metadata.violations():
         raise UnsoundError(where, f"{key} {violation}")
     if (wrong := shapes_fault(shapes, metadata.periodicity)) is not None:
@@ -494,6 +518,7 @@ def trajectory_in(group: h5py.Group, verify: bool = False, frames: slice | None 
         openings=openings,
         start_time=begins + metadata.frame_dt * first_frame,
         is_prediction=is_prediction,
+        termination=None if end is None or last_frame < num_frames else replace(end, frame=end.frame - first_frame),
     )
     return found.present()
 

@@ -449,10 +449,18 @@ class Trajectory:
         )
 
     def frames(self, start: int, stop: int | None = None) -> Trajectory:
-        """Return the frames ``start:stop`` as a trajectory. Nodes that are in none of them are left out."""
+        """Return the frames ``start:stop`` as a trajectory. Nodes that are in none of them are left out.
+
+        The reason why a rollout stopped belongs to its end. Frames that leave out the end have none.
+
+        Raises:
+            ValueError: there is no such frame.
+        """
         first, last, _ = slice(start, stop).indices(self.num_frames)
         if first == 0 and last == self.num_frames:
             return self
+        if first >= last:
+            raise ValueError(f"frames({start}, {stop}): has no frame; the trajectory has {self.num_frames} frames")
         stress = None if self.stress is None else Stress(self.stress.node[start:stop], self.stress.cell[start:stop])
         end = self.termination
         return replace(
@@ -461,7 +469,7 @@ class Trajectory:
             vel=self.vel[start:stop],
             boundary=self.boundary.at(start, stop),
             stress=stress,
-            termination=None if end is None else replace(end, frame=end.frame - first),
+            termination=None if end is None or last < self.num_frames else replace(end, frame=end.frame - first),
             alive=None if self.alive is None else self.alive[start:stop],
             force=None if self.force is None else self.force[start:stop],
             start_time=self.start_time + first * self.metadata.frame_dt,
@@ -471,7 +479,12 @@ class Trajectory:
         """Return every ``stride``-th frame, from the first on, as a trajectory whose frames are ``stride`` times as long.
 
         Velocities of nodes stay those at the frames. Boundary nodes get their mean velocities over the longer frames, and forces are averaged, too.
+
+        Raises:
+            ValueError: ``stride`` is not a positive whole number.
         """
+        if not isinstance(stride, int | np.integer) or stride < 1:
+            raise ValueError(f"stride={stride!r}: must be a positive whole number of frames")
         if stride == 1:
             return self
         stop = self.termination

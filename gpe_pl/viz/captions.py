@@ -23,7 +23,7 @@ def with_heading(first: Trajectory, others: Mapping[str, Trajectory]) -> dict[st
     """Return all trajectories by name. The first one is called ``ground truth`` or ``prediction``, see ``heading``.
 
     Raises:
-        ValueError: another trajectory has the name of the first, or frames of another length.
+        ValueError: another trajectory has the name of the first, frames of another length, or another time in its first frame.
     """
     name = heading(first)
     if name in others:
@@ -33,6 +33,10 @@ def with_heading(first: Trajectory, others: Mapping[str, Trajectory]) -> dict[st
             raise ValueError(
                 f"{label!r} has frames of {other.metadata.frame_dt:g} s and the {name} of {first.metadata.frame_dt:g} s; take every so many frames of one "
                 "(Trajectory.every)"
+            )
+        if abs(other.start_time - first.start_time) > 0.5 * first.metadata.frame_dt:
+            raise ValueError(
+                f"{label!r} begins at {other.start_time:g} s and the {name} at {first.start_time:g} s; cut one of them (Trajectory.frames)"
             )
     return {name: first, **others}
 

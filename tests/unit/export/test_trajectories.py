@@ -222,6 +222,10 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         write_vtk(tmp_path / "a.pvd", truth, stride=0)
     with pytest.raises(ValueError, match=r"ground truth has \(5, 25\) frames and nodes, the trajectory \(12, 25\)"):
         write_vtk(tmp_path / "a.pvd", truth, truth.frames(0, 5))
+    with pytest.raises(
+        ValueError, match=r"the trajectory begins at 0\.\d+ s, the ground truth at 0 s; cut one of them \(Trajectory\.frames\)"
+    ):
+        write_vtk(tmp_path / "a.pvd", truth.frames(5), truth)
     with pytest.raises(ValueError, match=r"a NumPy archive ends in \.npz"):
         write_npz(tmp_path / "a.npy", truth)
     assert not [*tmp_path.iterdir()]

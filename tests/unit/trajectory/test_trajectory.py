@@ -92,6 +92,8 @@ def test_only_some_frames(shard: Path, trajectory: Trajectory) -> None:
     assert_same(part, trajectory.frames(2, 5))
     with pytest.raises(ValueError, match="verify"):
         read_trajectory(shard, "00000", verify=True, frames=slice(2, 5))
+    with pytest.raises(ValueError, match=r"must not have a step; take every so many frames with Trajectory\.every"):
+        read_trajectory(shard, "00000", frames=slice(0, None, 2))
 
 
 def test_a_part_remembers_when_it_begins(tmp_path: Path, trajectory: Trajectory) -> None:
@@ -334,9 +336,39 @@ def test_a_part_knows_when_its_rollout_stopped(trajectory: Trajectory) -> None:
         (stopped.frames(3), 6),
         (stopped.frames(2).every(2), 4),
         (stopped.every(2).frames(1), 4),
-        (stopped.frames(0, 2), 9),
     ):
         assert part.termination is not None and part.termination.frame == frame
+    assert stopped.frames(0, 2).termination is None  # these frames are good
+
+
+def test_the_reason_why_a_rollout_stopped_is_stored(tmp_path: Path, trajectory: Trajectory) -> None:
+    end = Termination("escape", 6, 3, "frame 6: node 3 is outside")
+    write_shard(tmp_path / "a.h5", [replace(trajectory, termination=end), trajectory])
+    assert read_trajectory(tmp_path / "a.h5", "00000", verify=True).termination == end
+    assert read_trajectory(tmp_path / "a.h5", "00001", verify=True).termination is None
+    assert read_trajectory(tmp_path / "a.h5", "00000", frames=slice(2, None)).termination == replace(end, frame=4)
+    assert read_trajectory(tmp_path / "a.h5", "00000", frames=slice(2, 5)).termination is None
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        assert "termination" not in file["00001"].attrs
+        for text in ("null", '{"reason": "x"}', '{"reason": "x", "frame": "6", "node": 0, "message": ""}'):
+            file["00000"].attrs["termination"] = np.bytes_(text.encode())
+            file.flush()
+            with pytest.raises(StoreError, match="attribute 'termination' is unreadable: must have reason, frame, node, message"):
+                read_trajectory(tmp_path / "a.h5", "00000")
+
+
+@pytest.mark.parametrize("stride", [0, -1])
+def test_a_stride_is_a_number_of_frames(trajectory: Trajectory, stride: int) -> None:
+    with pytest.raises(ValueError, match="must be a positive whole number of frames"):
+        trajectory.every(stride)
+
+
+def test_a_part_has_a_frame(shard: Path, trajectory: Trajectory) -> None:
+    for first, last in ((6, None), (3, 3), (4, 2)):
+        with pytest.raises(ValueError, match=r"has no frame; the trajectory has 6 frames"):
+            trajectory.frames(first, last)
+        with pytest.raises(StoreError, match="has 6 frames, and none of slice"):
+            read_trajectory(shard, "00000", frames=slice(first, last))
 
 
 @pytest.mark.parametrize(("frame", "history"), [(-1, 0), (6, 0), (2, 3), (6, 2)])

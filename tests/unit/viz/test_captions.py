@@ -145,6 +145,18 @@ def test_a_stored_prediction_stays_one(tmp_path: Path) -> None:
     assert [read_trajectory(tmp_path / "a.h5", name).is_prediction for name in ("00000", "00001")] == [False, True]
 
 
+def test_trajectories_that_begin_at_other_times_are_not_shown_together(tmp_path: Path) -> None:
+    late = predicted().frames(1)
+    for show in (
+        lambda: rollout_figure(truth(), {"other": late}),
+        lambda: write_animation(tmp_path / "a.gif", truth(), {"other": late}),
+        lambda: write_viewer(tmp_path / "a.html", truth(), {"other": late}),
+    ):
+        with pytest.raises(ValueError, match=r"'other' begins at 0.\d+ s and the ground truth at 0 s; cut one of them"):
+            show()
+    assert not [*tmp_path.iterdir()]
+
+
 @pytest.mark.slow
 def test_a_distance_between_predictions_is_no_error() -> None:
     bars = [rollout_figure(first, {"other": predicted()}, color="error").axes[-1].get_ylabel() for first in (truth(), predicted())]
