@@ -20,7 +20,7 @@ from jaxtyping import Float
 from gpe_pl.schema import CELL_KINDS, MESH_MATERIALS, node_code
 from gpe_pl.trajectory.cells import kinds_of, mean_over_corners
 from gpe_pl.trajectory.strain import deformation_gradients, lame_parameters, neo_hookean_density, shape_gradients
-from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def strain_energy(trajectory: Trajectory) -> Float[np.ndarray, "frame"] | None:
 
     A cell takes the mean of Young's modulus and Poisson's ratio over its corners, as the finite element solver does. Poisson's ratio is a material parameter,
     or a setting of the solver in the metadata. Crushed and inverted cells have a large, finite energy. The material point solver keeps a deformation gradient
-    per particle, so its own energy differs from that of the cells between its particles.
+    per particle, so its own energy differs from that of the cells between its particles. In a periodic domain, a cell must be smaller than half of it.
 
     Returns:
         None without a mesh, for lines, surfaces in 3D and wedges, and where Young's modulus or Poisson's ratio is not known.
@@ -110,12 +110,20 @@ def strain_energy(trajectory: Trajectory) -> Float[np.ndarray, "frame"] | None:
     for code in np.unique(kinds):
         chosen = kinds == code
         corners = cells[chosen, : list(CELL_KINDS.values())[code][1]]
-        gradient, volume = shape_gradients(rest[corners])
+        gradient, volume = shape_gradients(_whole(rest[corners], trajectory.metadata))
         volume = np.abs(volume)  # corners in the reverse order describe the same cell
         for frame in range(trajectory.num_frames):
-            deformation = deformation_gradients(trajectory.pos[frame, corners].astype(np.float64), gradient)
+            deformation = deformation_gradients(_whole(trajectory.pos[frame, corners].astype(np.float64), trajectory.metadata), gradient)
             energy[frame] += np.sum(neo_hookean_density(deformation, lam[chosen], mu[chosen]) * volume)
     return energy
+
+
+def _whole(corners: Float[np.ndarray, "cell corner dim"], metadata: Metadata) -> Float[np.ndarray, "cell corner dim"]:
+    """Return the corners of cells beside the first of each, also of cells that a seam of the domain divides."""
+    if not any(metadata.periodic):
+        return corners
+    first = corners[:, :1]
+    return first + metadata.periodicity.shortest(corners - first)
 
 
 def _elastic_constants(trajectory: Trajectory) -> tuple[Float[np.ndarray, "node"], Float[np.ndarray, "node"]]:

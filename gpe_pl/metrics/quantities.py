@@ -1,7 +1,7 @@
 """Quantities that an engineer asks of a scene: energy, momentum, run-out, bounce height, deflection and peak stress, over time and as one number per scene.
 
 Velocities are those of the frames, (x[t] − x[t−1]) / Δt, in predictions and ground truth alike. In 2D, energies, momenta and masses are per metre of depth.
-Axes without gravity are horizontal. In scenes without gravity all axes are, and there is no height.
+Horizontal is across gravity. In scenes without gravity all directions are horizontal, and there is no height.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ def quantities(trajectory: Trajectory) -> dict[str, Quantity]:
     - ``kinetic energy``, ``potential energy`` (0 in frame 1), ``elastic energy`` where ``strain_energy`` knows it [J].
     - ``momentum``: magnitude of the total momentum [kg m/s].
     - ``run-out``: horizontal distance from the first centre of mass within which ``RUN_OUT_FRACTION`` of the mass is [m]; one number: at the end.
+      Along a periodic axis, the material must be narrower than half of the domain in frame 0.
     - ``height``: height of the centre of mass above that in frame 1 [m].
     - ``bounce height``: rise of the centre of mass above its lowest earlier place, since it began to fall [m]; one number: the largest.
     - ``deflection``, in scenes with nodes whose motion is given: largest distance of a node from its rest position [m]; one number: the largest.
@@ -63,18 +64,20 @@ def quantities(trajectory: Trajectory) -> dict[str, Quantity]:
     energy = strain_energy(trajectory)
     if energy is not None:
         found["elastic energy"] = Quantity("J", energy[1:])
-    out = _run_out(motion.pos, motion.centre[0], trajectory.mass, gravity == 0)
-    found["run-out"] = Quantity("m", out, float(out[-1]))
     strength = float(np.linalg.norm(gravity))
+    up = -gravity / strength if strength else np.zeros(len(gravity))
+    out = _run_out(_way_from_centre(trajectory, motion.pos), trajectory.mass, up)
+    found["run-out"] = Quantity("m", out, float(out[-1]))
     if strength:
-        height = (motion.centre - motion.centre[0]) @ (-gravity / strength)
+        height = (motion.centre - motion.centre[0]) @ up
         rise = _rise(height)
         found["potential energy"] = Quantity("J", mass * strength * height)
         found["height"] = Quantity("m", height)
         found["bounce height"] = Quantity("m", rise, float(rise.max()))
     if trajectory.prescribed is not None:
         rest = trajectory.pos[0] if trajectory.rest_pos is None else trajectory.rest_pos
-        bent = np.linalg.norm(trajectory.pos[1:].astype(np.float64) - rest, axis=-1).max(axis=1)
+        start = displacement(trajectory.pos[0], rest, trajectory.metadata)
+        bent = np.linalg.norm(start + motion.pos - trajectory.pos[0], axis=-1).max(axis=1)
         found["deflection"] = Quantity("m", bent, float(bent.max()))
     if trajectory.stress is not None:
         peak = von_mises(np.asarray(trajectory.stress.node[1:], np.float64)).max(axis=1)
@@ -96,10 +99,19 @@ def _of_open_scene(trajectory: Trajectory) -> dict[str, Quantity]:
     }
 
 
+def _way_from_centre(trajectory: Trajectory, pos: Float[np.ndarray, "frame node dim"]) -> Float[np.ndarray, "frame node dim"]:
+    """Return positions minus the centre of mass of the first of these frames. In a periodic domain, nodes are first brought together beside one of them."""
+    if any(trajectory.metadata.periodic) and trajectory.num_nodes:
+        there = pos[0, :1]
+        pos = pos - pos[0] + there + displacement(pos[0], np.broadcast_to(there, pos[0].shape), trajectory.metadata)
+    fraction = trajectory.mass.astype(np.float64) / trajectory.mass.sum(dtype=np.float64)
+    return pos - np.einsum("n,nd->d", fraction, pos[0])
+
+
 def _run_out(
-    pos: Float[np.ndarray, "frame node dim"], start: Float[np.ndarray, "dim"], mass: Float[np.ndarray, "node"], horizontal: np.ndarray
+    way: Float[np.ndarray, "frame node dim"], mass: Float[np.ndarray, "node"], up: Float[np.ndarray, "dim"]
 ) -> Float[np.ndarray, "frame"]:
-    distance = np.linalg.norm((pos - start)[..., horizontal], axis=-1)
+    distance = np.linalg.norm(way - (way @ up)[..., None] * up, axis=-1)
     order = np.argsort(distance, axis=1)
     within = np.cumsum(mass.astype(np.float64)[order], axis=1) / mass.sum(dtype=np.float64)
     node = np.argmax(within >= RUN_OUT_FRACTION - 1e-12, axis=1)

@@ -93,3 +93,30 @@ def test_deflection_is_the_way_of_the_node_farthest_from_rest() -> None:
     found = quantities(replace(moving(pos, (0.0, 0.0)), prescribed=FIRST, rest_pos=pos[0]))["deflection"]
     assert found.over_time.tolist() == pytest.approx([0.0, 0.5, 0.0]) and found.value == pytest.approx(0.5)
     assert quantities(replace(moving(pos), prescribed=FIRST))["deflection"].value == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("gravity", [(0.0, -GRAVITY), (1e-9, -GRAVITY), (4.0, -3.0)])
+def test_run_out_is_across_gravity_in_any_direction(gravity: tuple[float, float]) -> None:
+    down = np.array(gravity) / np.linalg.norm(gravity)
+    across, time = np.array([-down[1], down[0]]), np.arange(4.0)[:, None, None]
+    pos = np.zeros((4, 20, 2)) + 0.01 * time * down + 0.1 * (time - 1) * across  # all nodes move alike, 0.1 m across in a frame
+    assert quantities(moving(pos, gravity))["run-out"].value == pytest.approx(0.2, rel=1e-5)
+
+
+def test_a_body_that_moves_over_a_seam_is_not_strained() -> None:
+    grid = 0.05 * np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2)
+    triangles = np.array([c for j in range(3) for i in range(3) for a in [4 * j + i] for c in ([a, a + 1, a + 4], [a + 1, a + 5, a + 4])])
+    way = 0.02 * np.arange(40)[:, None, None] * np.array([1.0, 0.0])
+    own: dict[str, Any] = {"cells": triangles, "prescribed": np.arange(16) < 4, "bounds": ((0, 1), (0, 1)), "periodic": (True, False)}
+    for first in (0.5, 0.95):  # the second is divided from the beginning
+        body = Trajectory.from_numpy(
+            (grid + np.array([first, 0.3]) + way) % 1.0,
+            0.005,
+            "elastomer",
+            {"elastomer": {"youngs_modulus": 1e5, "poisson_ratio": 0.3}},
+            **own,
+        )
+        found = quantities(body)
+        assert found["elastic energy"].over_time.max() < 1e-6  # a cell of this body has 0.1 J at a strain of a hundredth
+        assert found["deflection"].value == pytest.approx(0.78, rel=1e-5)
+        assert found["run-out"].over_time[0] < 0.15
