@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +42,7 @@ EXODUS_KINDS = {
 """Names in meshio of cells by the first three letters of their names in Exodus."""
 DECIMAL = re.compile(r"([0-9]+(?:[.][0-9]+)?(?:e[-+][0-9]+)?)", re.IGNORECASE)
 """A number, which may have decimals and an exponent."""
+WHOLE = re.compile(r"[0-9]+")
 COMPONENTS = (("xx", "yy", "zz", "xy", "yz", "xz"), ("xx", "yy", "zz", "xy", "yz", "zx"), ("x", "y", "z"), ("x", "y"))
 """Endings of the names of the components of tensors, in VTK's order, and of vectors."""
 WEDGE = [0, 2, 1, 3, 5, 4]
@@ -109,13 +111,17 @@ def read_series(path: Path) -> list[Frame]:
     """Read all frames of a trajectory.
 
     Raises:
-        Refusal: a file is missing, damaged or of an unknown format, or has cells that are not linear.
+        Refusal: a file is missing, damaged or of an unknown format, has cells that are not linear, or has only a part of a frame.
     """
     if path.is_dir():
         files = _in_order([file for file in path.iterdir() if file.is_file()])
         return [Frame.of(file.name, None, _mesh(file)) for file in files]
     if path.suffix.lower() == ".pvd":
-        return [Frame.of(file.name, time, _mesh(file)) for time, file in _collection(path)]
+        collection = _collection(path)
+        repeated, count = max(Counter(time for time, _ in collection).items(), key=lambda item: item[1], default=(0.0, 0))
+        if count > 1:
+            raise Refusal(f"{path.name} lists {count} files for the time {repeated:g}; join the parts of each time into one file")
+        return [Frame.of(file.name, time, _mesh(file)) for time, file in collection]
     reader: Callable[[Path], Iterator[tuple[float, Any]]] = _xdmf if path.suffix.lower() in XDMF else _exodus
     with _readable(path):
         return [Frame.of(path.name, time, mesh) for time, mesh in reader(path)]
@@ -125,7 +131,7 @@ def _in_order(files: list[Path]) -> list[Path]:
     """Return files in the order of the numbers in their names.
 
     Raises:
-        Refusal: the order depends on whether ``0.1`` is a number with decimals or two numbers.
+        Refusal: the order depends on whether ``0.1`` is a number with decimals or two numbers, or a number is missing.
     """
     ordered = sorted(files, key=lambda file: natural(file.name))
     by_value = sorted(ordered, key=lambda file: [float(part) if k % 2 else part for k, part in enumerate(DECIMAL.split(file.stem))])
@@ -135,7 +141,22 @@ def _in_order(files: list[Path]) -> list[Path]:
                 f"{whole.name} and {decimal.name}: the order of files is not clear, because their numbers have decimals; number them 0, 1, 2, …, or list them "
                 "with their times in a PVD file"
             )
+    _require_all_numbers(ordered)
     return ordered
+
+
+def _require_all_numbers(files: list[Path]) -> None:
+    """Raise a refusal for numbers such as 0, 1, 2, 4, 5. Numbers without a common step, such as those of iterations, say nothing."""
+    numbers = [int(found[-1]) for file in files if (found := WHOLE.findall(file.stem))]
+    steps = np.diff(numbers)
+    if len(numbers) < len(files) or len(steps) < 3 or steps.min() <= 0:
+        return
+    usual, largest = int(np.median(steps)), int(np.argmax(steps))
+    if steps.min() == usual < steps[largest] and (steps % usual == 0).all():
+        raise Refusal(
+            f"between {files[largest].name} and {files[largest + 1].name}, files are missing: other numbers rise by {usual}; give all files, or list them "
+            "with their times in a PVD file"
+        )
 
 
 def times_of(path: Path) -> np.ndarray | None:

@@ -107,4 +107,8 @@ def check_intervals(times: np.ndarray, facts: Facts, advice: str) -> None:
     steps = np.diff(times)
     expected = facts.frame_dt or steps[0]
     if steps.min() <= 0 or np.ptp(steps) > UNEVEN * steps[0] or abs(steps[0] / expected - 1) > UNEVEN:
+        if facts.frame_dt and steps.min() > 0 and np.ptp(steps) <= UNEVEN * steps[0]:
+            raise Refusal(
+                f"results are {steps[0]:g} s apart, and frame_dt is {facts.frame_dt:g} s (of the command, or of other trajectories); both must be the same"
+            )
         raise Refusal(f"intervals between results are {steps.min():g} to {steps.max():g} s, expected {expected:g} s; {advice}")

@@ -255,6 +255,27 @@ def test_files_are_in_the_order_of_their_numbers(tmp_path: Path, names: str, is_
             imported(tmp_path, frame_dt=DT)
 
 
+@pytest.mark.parametrize(
+    ("numbers", "missing"),
+    [
+        ("0 1 2 3 5 6", ("out_3.vtu", "out_5.vtu", 1)),
+        ("0 10 20 40 50", ("out_20.vtu", "out_40.vtu", 10)),
+        ("0 10 20 30", None),
+        ("0 103 205 311 402", None),  # iterations
+    ],
+)
+def test_a_missing_number_is_told(tmp_path: Path, numbers: str, missing: tuple[str, str, int] | None) -> None:
+    (tmp_path / "raw" / "a").mkdir(parents=True)
+    for frame, number in enumerate(numbers.split()):
+        meshio.Mesh(FLAT + frame * SIZE, [("triangle", TRIANGLES)]).write(tmp_path / "raw" / "a" / f"out_{number}.vtu")
+    if missing is None:
+        assert imported(tmp_path, frame_dt=DT).num_frames == len(numbers.split())
+    else:
+        before, after, usual = missing
+        with pytest.raises(ImportFailure, match=f"between {before} and {after}, files are missing: other numbers rise by {usual}"):
+            imported(tmp_path, frame_dt=DT)
+
+
 @pytest.mark.parametrize("refers", [False, True])
 def test_grids_of_xdmf_have_their_own_points(tmp_path: Path, refers: bool) -> None:
     """Or refer to those of the first grid."""
@@ -337,6 +358,19 @@ def test_a_damaged_file_uneven_times_and_wrong_settings_are_named(tmp_path: Path
         imported(tmp_path, arrays={"displacemnt": "U"})
     write_xdmf(tmp_path / "raw" / "train", 1.1)
     with pytest.raises(ImportFailure, match="intervals between results are .* write results at even intervals"):
+        imported(tmp_path)
+    write_xdmf(tmp_path / "raw" / "train", 1.0)
+    with pytest.raises(ImportFailure, match=r"results are \S+ s apart, and frame_dt is \S+ s \(of the command, or of other trajectories\)"):
+        imported(tmp_path, frame_dt=2 * DT)
+
+
+def test_several_parts_of_a_time_are_told(tmp_path: Path) -> None:
+    write_folder(tmp_path / "raw")
+    entries = "".join(
+        f'<DataSet timestep="{DT * frame}" part="{part}" file="beam/step_{frame}.vtu"/>' for frame in range(3) for part in range(2)
+    )
+    (tmp_path / "raw" / "beam.pvd").write_text(f'<VTKFile type="Collection"><Collection>{entries}</Collection></VTKFile>')
+    with pytest.raises(ImportFailure, match=r"beam.pvd lists 2 files for the time 0; join the parts of each time into one file"):
         imported(tmp_path)
 
 

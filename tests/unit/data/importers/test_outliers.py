@@ -56,6 +56,18 @@ def test_a_trajectory_that_was_cut_off(tmp_path: Path) -> None:
     assert said == ["train, 1.npz: has 26 frames, most trajectories have 30: was it cut off?"]
 
 
+def test_a_frame_that_was_written_twice(tmp_path: Path) -> None:
+    doubled = np.insert(flying(1)["pos"], 15, flying(1)["pos"][14], axis=0)[:NUM_FRAMES]
+    said = warnings(tmp_path, [flying(0), flying(1, pos=doubled), *map(flying, range(2, 5))])
+    assert said == ["train, 1.npz, frame 15: is equal to frame 14, and nodes move before and after: was it written twice?"]
+
+
+def test_the_top_of_a_throw_is_no_frame_that_was_written_twice(tmp_path: Path) -> None:
+    height = 0.05 - 4.9 * (DT * (np.arange(NUM_FRAMES) - 10.5)) ** 2  # frames 10 and 11 are equal
+    said = warnings(tmp_path, [flying(k, pos=BLOCK + np.array([k, 3.0]) + height[:, None, None] * np.array([0.0, 1.0])) for k in range(2)])
+    assert not any("written twice" in warning for warning in said)
+
+
 def test_lengths_that_all_differ_are_no_fault(tmp_path: Path) -> None:
     assert not warnings(tmp_path, [flying(k, pos=flying(k)["pos"][: 30 - k]) for k in range(5)])
 
