@@ -335,14 +335,16 @@ def _check_motion(m: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[Findin
     if pos.shape[0] < 2 or pos.shape[1] < 1:
         yield "pos", f"has {pos.shape[0]} frames and {pos.shape[1]} nodes; at least 2 frames and 1 node are needed"
         return
+    yield from (("pos", text) for text in outside_bounds(m, pos))
+
+
+def outside_bounds(m: Metadata, pos: np.ndarray) -> Iterator[str]:
+    """Yield the first position [frame, node, dim] outside the bounds of the domain, for each axis that is not periodic."""
     for axis, (low, high) in enumerate(m.bounds):
         slack = 1e-5 * max(abs(low), abs(high), high - low)  # rounding to float32, and the margin of the solvers
         outside = (pos[..., axis] < low - slack) | (pos[..., axis] > high + slack)
         if m.periodic[axis : axis + 1] != (True,) and (where := _offenders("pos", outside)):
-            yield (
-                "pos",
-                f"{where}: {'xyz'[axis : axis + 1]} = {pos[..., axis][outside][0]:.6g} m is outside the bounds {low:g} … {high:g} m",
-            )
+            yield f"{where}: {'xyz'[axis : axis + 1]} = {pos[..., axis][outside][0]:.6g} m is outside the bounds {low:g} … {high:g} m"
 
 
 def _check_shapes(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Shape, ...], sound: bool) -> Iterator[Finding]:

@@ -19,6 +19,7 @@ from gpe_pl.data.importers.sampled import degrees_of, speed_and_acceleration
 from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
 from gpe_pl.data.importers.splits import arranged
 from gpe_pl.data.importers.survey import NUM_SAMPLED, SPACING_RATIO, Survey
+from gpe_pl.data.importers.trained_parameters import TrainedParameters, parameters_in
 from gpe_pl.data.position_rounding import ROUNDING_FRACTION, better_origin, rounding_fault
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.errors import GpeError
@@ -175,7 +176,7 @@ class _Conversion:
         self.facts, self.holdout, self.folder, self.about = source.facts, holdout, folder, about
         self.report = Report(name, about["format"], about["source"], str(folder), warnings=list(source.warnings))
         self.survey = Survey()
-        self.trained: dict[str, tuple[float, float]] = {}
+        self.trained = TrainedParameters()
         self.origin = np.zeros(0)
         self.on_progress, self.num_read = on_progress, 0
 
@@ -423,18 +424,17 @@ class _Conversion:
             m, dataset=self.report.name, materials=materials, stress_materials=stressed, loads=tuple(name for name in LOADS if name in self.survey.loads),
             param_names=names, spacing=facts.spacing,
             connectivity_radius=facts.connectivity_radius, split=split,
-            parameter_group=self._parameter_group(columns, names) if split == "test_unseen" else "seen", solver=f"import/{self.about['format']}",
+            parameter_group="seen", solver=f"import/{self.about['format']}",
             solver_version=VERSION, config=json.dumps(self.about, sort_keys=True, default=str),
         )  # fmt: skip
-        return replace(trajectory, metadata=metadata, material_params=columns)
+        unified = replace(trajectory, metadata=metadata, material_params=columns)
+        return (
+            replace(unified, metadata=replace(metadata, parameter_group=self._unseen_group(unified))) if split == "test_unseen" else unified
+        )
 
-    def _parameter_group(self, columns: np.ndarray, names: tuple[str, ...]) -> ParameterGroup:
-        """Return ``extrapolated`` if a parameter in ``test_unseen`` lies outside the range of its training values, else ``interpolated``."""
-        for column, name in zip(columns.T, names, strict=True):
-            low, high = self.trained.get(name, (np.inf, -np.inf))
-            if (column < low).any() or (column > high).any():
-                return "extrapolated"
-        return "interpolated"
+    def _unseen_group(self, trajectory: Trajectory) -> ParameterGroup:
+        """Return the group of a trajectory of ``test_unseen``: ``extrapolated`` if a parameter is outside the range of training, else ``interpolated``."""
+        return "extrapolated" if "extrapolated" in (group for *_, group in self.trained.groups(trajectory)) else "interpolated"
 
     def _count(self, trajectory: Trajectory, split: str) -> None:
         """Add a stored trajectory to the report."""
@@ -451,11 +451,21 @@ class _Conversion:
                 for parameter, column in zip(m.parameters_of(material), m.columns_of(material), strict=True):
                     values = trajectory.material_params[rows, column]
                     entry["parameters"][parameter.name] = _united(entry["parameters"].get(parameter.name), values)
-                    if split == "train":
-                        self.trained[parameter.name] = _united(self.trained.get(parameter.name), values)
-                if MATERIALS[material][0].name not in self.trained and "train" in self.survey.good:
-                    warning = f"{material} occurs in {split} but not in train: no model will know it"
-                    report.warnings += [warning] if warning not in report.warnings else []
+        if split == "train":
+            self.trained.add(trajectory)
+        elif "train" in self.survey.good:
+            report.warnings += [warning for warning in self._about_parameters(trajectory, split) if warning not in report.warnings]
+
+    def _about_parameters(self, trajectory: Trajectory, split: str) -> Iterator[str]:
+        """Yield warnings about materials and parameters of a trajectory that do not belong into its split."""
+        for material in sorted({material for material, *_ in parameters_in(trajectory)} - self.trained.materials):
+            yield f"{material} occurs in {split} but not in train: no model will know it"
+        groups = [*self.trained.groups(trajectory)]
+        for material, name, group in groups if split != "test_unseen" else ():
+            if group == "extrapolated":
+                yield f"{split} has values of {name} of {material} outside those of train, and counts as seen; such trajectories belong into test_unseen"
+        if split == "test_unseen" and groups and all(group == "seen" for *_, group in groups):
+            yield "test_unseen has trajectories whose parameters all occur in train, and counts as unseen; such trajectories belong into test"
 
     def _summarize(self, folder: Path) -> None:
         """Write statistics of the training trajectories (without any, of the first split), and report their neighbours and motion."""

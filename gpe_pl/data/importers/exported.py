@@ -57,9 +57,4 @@ def load(path: Path, names: Sequence[str], given: Facts) -> Loaded:
     if trajectory.openings:
         raise Refusal("is an open scene, which cannot be imported")
     what = "its name is that of a rollout of a model, which is no ground truth (evaluation.export); leave the file out if it is one"
-    warnings = [what] if path.name.startswith("rollout_") else []
-    if (end := trajectory.termination) is not None:
-        warnings.append(
-            f"is a rollout that stopped after {trajectory.num_frames} frames ({end.reason}: {end.message}); its last frames may be wrong"
-        )
-    return Loaded(trajectory, warnings=tuple(warnings))
+    return Loaded(trajectory, warnings=(what,) if path.name.startswith("rollout_") else ())

@@ -14,6 +14,7 @@ from gpe_pl.data.importers.report import Event
 from gpe_pl.data.importers.sampled import free_flight_of
 from gpe_pl.data.importers.source import Facts, Item, Loaded, Refusal
 from gpe_pl.data.position_rounding import MotionSummary, motion_of
+from gpe_pl.data.validate import outside_bounds
 from gpe_pl.schema import HISTORY, NODE_TYPES, stored_parameters
 from gpe_pl.trajectory.arrays import nearest_distances
 from gpe_pl.trajectory.rigid_deformation import rigid_deformation
@@ -99,6 +100,8 @@ class Survey:
         trajectory, name = loaded.trajectory, item.name
         m, where = trajectory.metadata, f"{split}, {name}"
         arrays = stored_arrays(trajectory)
+        if trajectory.is_prediction:
+            raise Refusal("is a rollout of a model and no ground truth; leave it out, or replace is_prediction to learn from it")
         for fault in _faults(m, arrays):
             raise Refusal(fault)
         common = (m.frame_dt, m.dim, m.periodic)
@@ -130,6 +133,9 @@ class Survey:
         self.recordings.add(item, part)
         self.contents[id(item)] = m, trajectory.stress is not None
         self.suspects += [Event(split, name, -1, warning) for warning in loaded.warnings]
+        if (end := trajectory.termination) is not None:
+            what = f"stopped after {trajectory.num_frames} frames ({end.reason}: {end.message}): are its last frames right?"
+            self.suspects.append(Event(split, name, -1, what))
         self.motions.append((split, name, motion_of(m, trajectory.pos)))
         self.assumes_gravity.append(loaded.assumes_gravity)
         if (frame := _repeated_frame(trajectory)) is not None:
@@ -248,3 +254,4 @@ def _faults(m: Metadata, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
     yield from (f"{key} {violation}" for key, violation in m.violations())
     yield from size_conflicts(arrays, m.dim, len(m.param_names))
     yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))
+    yield from (f"pos: {text}" for text in outside_bounds(m, arrays["pos"]))

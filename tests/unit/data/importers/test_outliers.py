@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from gpe_pl.data.importers import ImportFailure
+from gpe_pl.data.importers import ImportFailure, save_dataset
 from gpe_pl.data.importers.report import Report
+from gpe_pl.data.importers.trained_parameters import MOST_VALUES, TrainedParameters
 from gpe_pl.trajectory.arrays import ArrayError, checked_bodies
+from gpe_pl.trajectory.store import iter_trajectories
+from gpe_pl.trajectory.trajectory import Termination, Trajectory
 from tests.unit.data.importers.test_formats import imported
 
 DT, GRAVITY, NUM_FRAMES, LANDS = 0.01, -9.81, 30, 24
@@ -137,3 +141,62 @@ def test_wrong_motion_is_noticed_in_late_trajectories_too(tmp_path: Path) -> Non
     fast["pos"][:LANDS] += np.array([0.0, 1.5 * GRAVITY]) * time**2
     (what,) = [w for w in warnings(tmp_path, [*(flying(k) for k in range(12)), fast]) if "gravity" in w]
     assert ", 12.npz: gravity is stored as (0, -9.81) m/s², but" in what
+
+
+def liquid(seed: int, viscosity: float = 1e-3, **changes: Any) -> Trajectory:
+    arrays = flying(seed)
+    return replace(Trajectory.from_numpy(arrays["pos"], DT, "fluid", {"fluid": viscosity}, gravity=(0.0, GRAVITY)), **changes)
+
+
+@pytest.mark.parametrize(
+    ("split", "viscosity", "group", "warning"),
+    [
+        ("test", 2e-3, "seen", None),
+        ("test", 0.5, "seen", "test has values of kinematic_viscosity of fluid outside those of train, and counts as seen"),
+        ("test_unseen", 2e-3, "interpolated", None),
+        ("test_unseen", 0.5, "extrapolated", None),
+        ("test_unseen", 3e-3, "interpolated", "test_unseen has trajectories whose parameters all occur in train, and counts as unseen"),
+    ],
+)
+def test_parameters_that_do_not_belong_into_their_split_are_told(
+    tmp_path: Path, split: str, viscosity: float, group: str, warning: str | None
+) -> None:
+    train = [liquid(k, 1e-3 if k % 2 else 3e-3) for k in range(4)]
+    said = save_dataset(tmp_path, "liquids", train=train, val=[liquid(8)], **{split: [liquid(9, viscosity)]}).warnings  # type: ignore[arg-type]
+    stored = next(iter_trajectories(tmp_path / "liquids" / "imported", split))
+    assert stored.metadata.parameter_group == group
+    told = [text for text in said if "occur" in text or "outside those" in text]
+    assert told == [] if warning is None else len(told) == 1 and told[0].startswith(warning)
+
+
+def test_a_material_that_shares_a_parameter_with_a_trained_one_is_told(tmp_path: Path) -> None:
+    def body(seed: int, material: str) -> Trajectory:
+        return Trajectory.from_numpy(flying(seed)["pos"], DT, material, {material: 1e5}, gravity=(0.0, GRAVITY))
+
+    said = save_dataset(
+        tmp_path, "bodies", train=[body(k, "elastomer") for k in range(4)], val=[body(8, "elastomer")], test=[body(9, "solid")]
+    )
+    assert "solid occurs in test but not in train: no model will know it" in said.warnings
+
+
+def test_many_values_of_a_parameter_leave_their_range() -> None:
+    trained = TrainedParameters()
+    for k in range(MOST_VALUES + 10):
+        trained.add(replace(liquid(0), material_params=np.full((36, 1), 1e-3 * (k + 1), np.float32)))
+    assert len(trained.values["fluid", "kinematic_viscosity"]) == MOST_VALUES
+    top = 1e-3 * (MOST_VALUES + 10)
+    groups = [[group for *_, group in trained.groups(liquid(0, value))] for value in (1e-3, 0.5 * top, top, 1.001 * top, 0.9e-3)]
+    assert groups == [["seen"], ["seen"], ["seen"], ["extrapolated"], ["extrapolated"]]
+
+
+def test_rollouts_of_models_and_positions_outside_are_refused(tmp_path: Path) -> None:
+    train = [liquid(k) for k in range(3)]
+    with pytest.raises(ImportFailure, match="is a rollout of a model and no ground truth"):
+        save_dataset(tmp_path, "a", train=train, val=[liquid(8, is_prediction=True)])
+    low = liquid(8)
+    low = replace(low, metadata=replace(low.metadata, bounds=((-9.0, 9.0), (3.0, 9.0))))
+    with pytest.raises(ImportFailure, match=r"pos: frame \d+.*: y = \S+ m is outside the bounds 3 … 9 m"):
+        save_dataset(tmp_path, "b", train=train, val=[low])
+    stopped = liquid(8, termination=Termination("nan", NUM_FRAMES, 0, "node 0 is not finite"))
+    said = save_dataset(tmp_path, "c", train=train, val=[stopped]).warnings
+    assert any("val[0]: stopped after 30 frames (nan: node 0 is not finite): are its last frames right?" in text for text in said)
