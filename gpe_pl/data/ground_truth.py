@@ -241,10 +241,10 @@ class DatasetSpec:
     def provenance(self) -> dict[str, Any]:
         """Settings of scene and solver, with the solver's name, version and largest substep; for finer labels also those of the finer solver."""
         scene = asdict(cast(Any, self.scene))
-        settings = {"scene": {"kind": type(self.scene).__name__, **scene}, "solver": _settings(self.solver, self.solver)}
+        settings = {"scene": {"kind": type(self.scene).__name__, **scene}, "solver": solver_settings(self.solver)}
         if self.fine == 1:
             return settings
-        finer = _settings(cast(FinerSolver, self.label_solver).solver, self.solver)
+        finer = solver_settings(cast(FinerSolver, self.label_solver).solver)
         return {**settings, "fine": self.fine, "fine_solver": {**finer, "spacing": self.scene.spacing / self.fine, "tracers": TRACERS}}
 
     def as_dict(self) -> dict[str, Any]:
@@ -269,11 +269,12 @@ class DatasetSpec:
         return index if self.train_scenes is None or split != "train" else self.train_scenes[index]
 
 
-def _settings(solver: Any, named: Solver) -> dict[str, Any]:
+def solver_settings(solver: Any) -> dict[str, Any]:
+    """Return the settings of a solver with its name, version and largest substep [s], as provenance stores them."""
     settings = asdict(solver)
     if settings.get("stress") is False:  # as in the specification of a data set without the stress of particles
         del settings["stress"]
-    return {**settings, "name": named.name, "version": named.version, "solver_dt": solver.solver_dt}
+    return {**settings, "name": solver.name, "version": solver.version, "solver_dt": solver.solver_dt}
 
 
 def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:

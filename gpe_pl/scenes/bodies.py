@@ -127,17 +127,24 @@ def image(path: Path, low: np.ndarray, high: np.ndarray) -> Callable[[np.ndarray
     """Return the region of the dark, opaque pixels of an image that is stretched over a rectangle.
 
     Raises:
-        BodyFault: the file cannot be read, or has no dark pixel.
+        BodyFault: the file cannot be read, has pixels of an unknown range, or has no dark pixel.
     """
     from PIL import Image
 
     try:
         with Image.open(path) as opened:
-            values = np.asarray(opened.convert("LA"), np.float64) / 255
+            mode = opened.mode
+            if mode.startswith("I;16"):
+                brightness = np.asarray(opened, np.float64) / (2**16 - 1)
+                values = np.stack([brightness, np.ones_like(brightness)], axis=-1)
+            else:
+                values = np.asarray(opened.convert("LA"), np.float64) / 255
     except FileNotFoundError:
         raise BodyFault(f"{path}: no such file (searched from {Path.cwd()})") from None
     except Exception as error:  # of the reader, of any type
         raise BodyFault(f"{path}: cannot be read as an image ({type(error).__name__})") from None
+    if mode in ("I", "F"):  # white may be any number
+        raise BodyFault(f"{path}: has pixels of mode {mode}, whose range is not known; save it with 8 or 16 bits")
     mask = (values[..., 0] < DARK) & (values[..., 1] > DARK)
     if not mask.any():
         raise BodyFault(f"{path}: has no dark pixels; draw the body black on white")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import math
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from typing import Any
 
 import torch
 
+from gpe_pl.data.ground_truth import solver_settings
 from gpe_pl.geometry.shapes import thickness
 from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -103,7 +105,9 @@ def solved(solver: Any, state: State, metadata: Metadata, num_frames: int, label
     """
     _warn_of_thin_obstacles(solver, state)
     stride = max(1, round(metadata.frame_dt / solver.frame_dt))
-    stored = replace(metadata, frame_dt=solver.frame_dt, solver=solver.name, solver_version=solver.version, solver_dt=solver.solver_dt)
+    config = json.dumps({**json.loads(metadata.config), "solver": solver_settings(solver)}, sort_keys=True)
+    about = {"solver": solver.name, "solver_version": solver.version, "solver_dt": solver.solver_dt, "config": config}
+    stored = replace(metadata, frame_dt=solver.frame_dt, **about)
     steps = math.ceil(num_frames * stride)
     with progress_bar(label) as on_progress:
         found = rollout(solver, state, steps, stored, guard_of(metadata), lambda frame, _: on_progress(frame, steps))

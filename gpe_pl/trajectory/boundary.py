@@ -21,6 +21,9 @@ from gpe_pl.trajectory.rigid_parts import carried_along
 Array = Any
 """A NumPy array or a torch tensor."""
 
+UNLIKE = 0.05
+"""Relative difference from which velocities of a boundary are not those of its positions."""
+
 
 @dataclass(frozen=True)
 class BoundaryMotion:
@@ -281,7 +284,10 @@ def has_nodes_beside_shapes(boundary: Boundary) -> bool:
 
 
 def check_steps(boundary: Boundary, frame_dt: float, periodicity: Periodicity) -> None:
-    """Raise ``ArrayError`` if a boundary node moves by more than half a period between frames, which means that its motion ignores the periodicity."""
+    """Raise ``ArrayError`` if velocities of the boundary are not those of its positions at ``frame_dt``.
+
+    The same if a boundary node moves by more than half a period between frames, which means that its motion ignores the periodicity.
+    """
     if boundary.motion is None:
         return
     for axis in periodicity.axes:
@@ -293,6 +299,13 @@ def check_steps(boundary: Boundary, frame_dt: float, periodicity: Periodicity) -
                 f"{periodicity.period[axis]:.4g} m; pass periodicity=Periodicity(bounds, periodic) and the same frame_dt to Boundary.moving",
                 int(frame),
             )
+    steps = periodicity.shortest(np.diff(boundary.motion.pos.astype(np.float64), axis=0))
+    ratio = np.sum(boundary.motion.vel[:-1] * frame_dt * steps) / max(np.sum(steps**2), np.finfo(float).tiny)
+    if steps.any() and abs(ratio - 1) > UNLIKE:
+        raise ArrayError(
+            f"boundary: its velocities are {ratio:.3g} times those of its positions, whose frames are {frame_dt:g} s apart; pass the same frame_dt to "
+            "Boundary.moving"
+        )
 
 
 def as_numpy(x: Array) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gpe_pl.evaluation.identification.scene import solver_of
 from gpe_pl.geometry.sections import section, solid_within
 from gpe_pl.geometry.shapes import Box
 from gpe_pl.learned.approximate import approximate
@@ -20,6 +21,7 @@ from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.scenes import predict
+from gpe_pl.scenes.bodies import BodyFault
 from gpe_pl.scenes.film import Film, FilmFault
 from gpe_pl.scenes.obstacles import Circle
 from gpe_pl.scenes.rollouts import predicted
@@ -79,6 +81,35 @@ def test_an_image_is_a_body_where_it_is_dark(tmp_path: Path) -> None:
     slack = SPACING
     assert (state.pos >= np.array([0.2, 0.3]) - slack).all() and (state.pos <= np.array([0.4, 0.4]) + slack).all()
     assert state.num_nodes * SPACING**2 == pytest.approx(0.2 * 0.1, rel=0.15)
+
+
+def test_an_image_of_16_bits_is_that_of_8_and_other_ranges_are_refused(tmp_path: Path) -> None:
+    pixels = np.full((40, 40), 255, np.uint8)
+    pixels[:20], pixels[20:30] = 0, 40
+    images = {
+        "8.png": pixels,
+        "16.png": pixels.astype(np.uint16) * 257,
+        "f.tiff": pixels.astype(np.float32) / 255,
+        "i.tiff": pixels.astype(np.int32),
+    }
+    for name, values in images.items():
+        Image.fromarray(values).save(tmp_path / name)
+
+    def count(name: str) -> int:
+        return Scene(box=(1.0, 1.0)).image("sand", tmp_path / name, at=(0.2, 0.2), size=(0.4, 0.4)).state(model("sand"))[0].num_nodes
+
+    assert count("8.png") == count("16.png")
+    for name, mode in (("f.tiff", "F"), ("i.tiff", "I")):
+        with pytest.raises(BodyFault, match=f"has pixels of mode {mode}, whose range is not known; save it with 8 or 16 bits"):
+            count(name)
+
+
+def test_a_solved_scene_has_the_settings_of_its_solver() -> None:
+    found = Scene(box=((0.5, 1.5), (0.0, 1.0))).block("sand", at=(0.9, 0.0), size=(0.1, 0.2)).solve(seconds=0.02).first
+    solver: Any = solver_of(found.metadata)
+    assert solver.bounds == found.metadata.bounds == ((0.5, 1.5), (0.0, 1.0))
+    again = rollout(solver, found.state(0), found.num_frames - 1, found.metadata)
+    np.testing.assert_array_equal(again.pos, found.pos)
 
 
 def test_a_polygon_is_a_body_in_either_direction() -> None:

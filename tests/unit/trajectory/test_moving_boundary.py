@@ -60,6 +60,18 @@ def truth() -> Trajectory:
     return scene()
 
 
+@pytest.mark.parametrize("factor", [0.5, 2.0, 10.0])
+def test_a_boundary_with_frames_of_another_length_is_refused(truth: Trajectory, factor: float) -> None:
+    way, normal = paddle()
+    wrong = Boundary.moving(way, normal, factor * DT)
+    with pytest.raises(
+        ArrayError, match=f"its velocities are {1 / factor:.3g} times those of its positions, whose frames are 0.01 s apart"
+    ):
+        Trajectory.from_numpy(truth.pos, DT, "fluid", {"fluid": 1e-3}, boundary=wrong, bounds=[[0, 1], [0, 1]])
+    still = Boundary.moving(np.repeat(way[:1], NUM_FRAMES, axis=0), normal, factor * DT)
+    assert Trajectory.from_numpy(truth.pos, DT, "fluid", {"fluid": 1e-3}, boundary=still, bounds=[[0, 1], [0, 1]]).num_frames == NUM_FRAMES
+
+
 @pytest.fixture
 def simulator(truth: Trajectory) -> LearnedSimulator:
     builder = GraphBuilder(GraphConfig(history=2), truth.metadata)
