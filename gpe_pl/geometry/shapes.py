@@ -584,14 +584,16 @@ def domain_walls(bounds: tuple[tuple[float, float], ...], friction: dict[str, fl
 
     Args:
         bounds: ``(low, high)`` per axis [m].
-        friction: one Coulomb coefficient, or one per wall by name (``x_low``, ``x_high``, ``y_low``, …).
+        friction: one Coulomb coefficient, or one for each wall by name (``x_low``, ``x_high``, ``y_low``, …), else ``ValueError`` is raised.
     """
+    names = [f"{'xyz'[axis]}_{side}" for axis in range(len(bounds)) for side in ("low", "high")]
+    each = friction if isinstance(friction, dict) else dict.fromkeys(names, friction)
+    if {*each} != {*names}:
+        raise ValueError(f"friction is given for {', '.join(each) or 'no wall'}; give one for each of {', '.join(names)}")
     low, high = tuple(b[0] for b in bounds), tuple(b[1] for b in bounds)
     walls = []
     for axis in range(len(bounds)):
-        for sign, side in ((1.0, "low"), (-1.0, "high")):
+        for sign, name in zip((1.0, -1.0), names[2 * axis : 2 * axis + 2], strict=True):
             normal = tuple(sign if k == axis else 0.0 for k in range(len(bounds)))
-            mu = friction[f"{'xyz'[axis]}_{side}"] if isinstance(friction, dict) else friction
-            offset = low[axis] if sign > 0 else -high[axis]
-            walls.append(Wall(normal, offset, low, high, mu))
+            walls.append(Wall(normal, low[axis] if sign > 0 else -high[axis], low, high, each[name]))
     return tuple(walls)

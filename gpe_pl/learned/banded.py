@@ -77,7 +77,7 @@ def roll_out_with_bands(
         )
     dt, spreads = metadata.frame_dt, [np.zeros(state.num_nodes)]
     if bands is not None:
-        _check_fit(bands, dt, members[0])
+        _check_fit(bands, dt, members[0], state.time)
     watch = Watch(members[0], num_steps)
     watch.see(0, state)
 
@@ -102,8 +102,8 @@ def roll_out_with_bands(
     return BandedRollout(trajectory, radius, own_spread, [line for line, _ in unlike.lines.values()])
 
 
-def _check_fit(bands: Bands, frame_dt: float, simulator: LearnedSimulator) -> None:
-    """Raise ``ValueError`` if bands are of frames of another length, and warn if they are of other approximate levels."""
+def _check_fit(bands: Bands, frame_dt: float, simulator: LearnedSimulator, start: float) -> None:
+    """Raise ``ValueError`` if bands are of frames of another length. Warn if they are of other approximate levels or of rollouts from another time [s]."""
     if not math.isclose(bands.frame_dt, frame_dt, rel_tol=1e-6):
         raise ValueError(
             f"the bands are of frames of {bands.frame_dt:g} s, those of the scene have {frame_dt:g} s; calibrate with such frames"
@@ -112,3 +112,10 @@ def _check_fit(bands: Bands, frame_dt: float, simulator: LearnedSimulator) -> No
     calibrated = {key.removeprefix(prefix): value for key, value in bands.settings.items() if key.startswith(prefix)}
     if calibrated != (own := simulator.skips.approximations):
         log.warning("error bands promise nothing: the calibration skipped %s, this rollout %s", calibrated or "nothing", own or "nothing")
+    if abs(start / frame_dt - bands.start_frame) > 0.5:
+        frame = start / frame_dt
+        log.warning(
+            "error bands promise nothing: the calibration began at frame %d of each scene, this rollout at frame %.3g",
+            bands.start_frame,
+            frame,
+        )

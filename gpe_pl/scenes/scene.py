@@ -33,7 +33,7 @@ from gpe_pl.scenes.film import Film
 from gpe_pl.scenes.obstacles import FRICTION, MeshObstacle
 from gpe_pl.scenes.recorded import NotRecorded, recorded_solver, settings
 from gpe_pl.scenes.rollouts import middle_values, predicted, solved
-from gpe_pl.scenes.zones import AT_ONCE, Zone, nodes_of, opening_of, speed_of
+from gpe_pl.scenes.zones import AT_ONCE, Zone, is_number, nodes_of, opening_of, speed_of
 from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.trajectory.boundary import Boundary
@@ -54,7 +54,7 @@ SHIPPED = {"sand": "sand", "snow": "snow", "elastomer": "elastomer", "fluid": "f
 
 
 def _is_friction(value: Any) -> bool:
-    return not isinstance(value, bool) and isinstance(value, (int, float)) and 0 <= value < math.inf
+    return is_number(value) and bool(0 <= value < math.inf)
 
 
 class SceneFault(GpeError, ValueError):
@@ -394,12 +394,13 @@ class Scene:
         density = given.pop("density", None)
         if density is not None:
             self._positive(name, "density", density)
+            density = float(density)
         for key, value in given.items():
             if key not in known:
                 raise SceneFault(
                     {name: f"{key}: unknown key{did_you_mean(key, (*known, 'velocity', 'density'))}; {material} has {', '.join(known)}"}
                 )
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
+            if not is_number(value):
                 raise SceneFault({name: f"{key}={value!r}: must be a number"})
             if fault := limits_fault(MATERIALS[material][known.index(key)], float(value)):
                 raise SceneFault({name: fault})
@@ -455,7 +456,7 @@ class Scene:
     @staticmethod
     def _positive(name: str, key: str, *values: Any) -> None:
         for value in values:
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
+            if not is_number(value) or not 0 < value < math.inf:
                 raise SceneFault({name: f"{key}={value!r}: must be a positive number"})
 
     def _misplaced(self) -> dict[str, str]:

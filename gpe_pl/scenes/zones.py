@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -61,7 +62,7 @@ def speed_of(low: np.ndarray, high: np.ndarray, side: str, speed: Any, flow_rate
     if flow_rate is not None:
         key, given, area = "flow_rate", flow_rate, float(np.prod(np.delete(high - low, "xyz".index(side[0]))))
     unit = (1.0 if is_inlet else -1.0) / area
-    if _is_number(given):
+    if is_number(given):
         if not 0 < given < math.inf:
             raise BodyFault(f"{key}={given!r}: must be a positive number")
         return unit * float(given)
@@ -75,13 +76,14 @@ def speed_of(low: np.ndarray, high: np.ndarray, side: str, speed: Any, flow_rate
     return tuple((time, unit * value) for time, value in table)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+def is_number(value: Any) -> bool:
+    """Tell whether a value is a real number, also one of NumPy."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
 def _table(key: str, given: Any) -> Table:
     pairs = list(given) if isinstance(given, (list, tuple)) else []
-    if not pairs or not all(isinstance(pair, (list, tuple)) and len(pair) == 2 and all(map(_is_number, pair)) for pair in pairs):
+    if not pairs or not all(isinstance(pair, (list, tuple)) and len(pair) == 2 and all(map(is_number, pair)) for pair in pairs):
         raise BodyFault(f"{key}={given!r}: must be a positive number, or pairs of a time [s] and a value, such as [[0, 0.5], [1, 1.5]]")
     table = tuple((float(time), float(value)) for time, value in pairs)
     if (wrong := speeds_fault(table)) is not None:

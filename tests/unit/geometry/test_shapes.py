@@ -166,6 +166,12 @@ def test_walls_close_the_domain() -> None:
         assert steps.max() <= 0.3 + 1e-12
 
 
+@pytest.mark.parametrize("friction", [{"x_low": 0.5}, {"x_low": 0.1, "x_high": 0.2, "y_low": 0.3, "y_high": 0.4, "z_low": 0.5}, {}])
+def test_each_wall_of_a_domain_has_a_friction(friction: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=r"friction is given for .*; give one for each of x_low, x_high, y_low, y_high"):
+        domain_walls(((0.0, 1.0), (0.0, 1.0)), friction)
+
+
 def test_nearest_of_several_shapes() -> None:
     shapes = (SOLIDS["disc"], SOLIDS["box 2D"])
     points = random_points(2)

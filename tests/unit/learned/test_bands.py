@@ -225,11 +225,13 @@ def test_an_ensemble_of_equal_members_is_its_member(checkpoint: Path) -> None:
 
 def test_bands_of_other_frames_are_refused_and_of_other_levels_marked(checkpoint: Path, caplog: pytest.LogCaptureFixture) -> None:
     single, own = LearnedSimulator.from_checkpoint(checkpoint), of_frames(calibrated(19, checkpoint))
-    start = single.standing(state().to_torch(), metadata())
+    start = replace(single.standing(state().to_torch(), metadata()), time=own.start_frame * metadata().frame_dt)
     with pytest.raises(ValueError, match=r"the bands are of frames of 0.02 s, those of the scene have 0.005 s"):
         roll_out_with_bands(single, start, 3, metadata(), replace(own, frame_dt=0.02))
     exact = roll_out_with_bands(single, start, 4, metadata(), own)
     assert "promise nothing" not in caplog.text
+    roll_out_with_bands(single, replace(start, time=start.time + 25 * metadata().frame_dt), 3, metadata(), own)
+    assert f"the calibration began at frame {own.start_frame} of each scene, this rollout at frame {own.start_frame + 25}" in caplog.text
     single.skips = Skips(repeat_frames=4)
     repeated = roll_out_with_bands(single, start, 4, metadata(), own)
     assert "the calibration skipped nothing, this rollout {'repeat_frames': 4}" in caplog.text

@@ -112,6 +112,14 @@ def test_a_solved_scene_has_the_settings_of_its_solver() -> None:
     np.testing.assert_array_equal(again.pos, found.pos)
 
 
+@pytest.mark.parametrize("kind", [int, np.int64, np.float32, np.float64])
+def test_numbers_of_numpy_are_numbers(kind: Any) -> None:
+    box = (kind(1), kind(1))
+    scene = Scene(box=box).block("sand", at=(0.1, 0.0), size=(0.2, 0.2), friction_angle=kind(30), density=kind(1500))
+    state, _ = scene.state(model("sand"))
+    assert (state.material_params == 30.0).all()
+
+
 def test_a_polygon_is_a_body_in_either_direction() -> None:
     corners = [(0.2, 0.2), (0.6, 0.2), (0.4, 0.6)]
     counts = [Scene(box=(1.0, 1.0)).polygon("sand", order).state(model("sand"))[0].num_nodes for order in (corners, corners[::-1])]
