@@ -18,6 +18,7 @@ from gpe_pl.scenes.scene import Point, Scene
 from gpe_pl.system.command_line import ArgumentFault, command, integer, number, truth
 
 if TYPE_CHECKING:
+    from gpe_pl.learned.simulator import LearnedSimulator
     from gpe_pl.trajectory.trajectory import Trajectory
 
 Method = Literal["auto", "gradient", "derivative_free"]
@@ -151,7 +152,7 @@ def design(
         raise DesignFault(f"shift=0: {name} is a disc, which does not turn; give a shift of more than 0")
     movable.check_limits(limits, state.boundary, state.pos, metadata.spacing)
     num_frames, goal = max(1, round(seconds / metadata.frame_dt)), np.asarray(target, np.float64)
-    start = simulator.standing(state, metadata)
+    start, solver = simulator.standing(state, metadata), _solver(scene, simulator) if solve else None
     guidance = Guidance(simulator, start, movable, limits, goal, num_frames, failed=(4 * metadata.longest_side) ** 2)
     before, began = guidance.misfit(np.full(len(guidance.unknowns), 0.5)), time.process_time()
     found = search(guidance, SearchSettings(method=method, num_scanned=3, max_evaluations=evaluations, profile_evaluations=0))
@@ -166,14 +167,21 @@ def design(
     failed = math.log(guidance.failed)
     distances = {"model": (math.nan if before >= failed else math.exp(before / 2), math.exp(after / 2))}
     rollouts, at_best = {}, moved.state(simulator)[0]
-    if solve:
-        solver = scene.solver_of(simulator)
+    if solver is not None:
         pair = [solved(solver, s, metadata, num_frames, f"solver {solver.name}") for s in (state, at_best)]
         before_it, after_it = (_distance(own, goal) for own in pair)
         distances["solver"], rollouts["solver"] = (before_it, after_it), pair[1]
     rollouts["model"] = predicted(simulator, at_best, metadata, num_frames, "model")
     check = "" if found.check is None or not is_better else str(found.check)
     return Design(moved, best, distances, rollouts, found.method, check, guidance.num_evaluations, guidance.num_gradients, spent)
+
+
+def _solver(scene: Scene, simulator: LearnedSimulator) -> Any:
+    """Return the solver of the model's training data. It is made before the search, so that no search is lost if it cannot compute the scene."""
+    try:
+        return scene.solver_of(simulator)
+    except GpeError as error:
+        raise DesignFault(f"solve=true: {error}; or give solve=false") from None
 
 
 def _distance(trajectory: Trajectory, goal: np.ndarray) -> float:

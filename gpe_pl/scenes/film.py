@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -56,19 +57,30 @@ class Film:
             if rollout.alive is not None:
                 line += f" in all{_account(rollout)}"
             if rollout is not self.first and rollout.alive is None:
-                line += f"; distance from the {heading(self.first)} {self.distance(name):.3g} m (root mean square)"
+                line += f"; {self._in_words(name)}"
             lines.append(line + (f"; stopped early, {rollout.termination.message}" if rollout.termination is not None else ""))
         return "\n".join(lines)
 
+    def _in_words(self, name: str) -> str:
+        """Return the distance of another rollout from the first, with the time that it covers if one of the two stopped early."""
+        shared, frames = (count(rollout.num_frames for rollout in (self.first, self.others[name])) - 1 for count in (min, max))
+        what = f"distance from the {heading(self.first)}"
+        if shared == 0:
+            return f"{what} not known, because they have no frame after the start in common"
+        until = f" over {shared * self.first.metadata.frame_dt:.3g} s" if shared < frames else ""
+        return f"{what} {self.distance(name):.3g} m (root mean square{until})"
+
     def distance(self, name: str) -> float:
         """Return the root mean square distance [m] of the nodes of another rollout from those of the first, over the frames that both have.
+
+        It is NaN if they have none after the start in common.
 
         Nodes of open scenes are at other places after some time, so there the distance says nothing; compare ``metrics.open_scenes``.
         """
         other = self.others[name]
         count = min(self.first.num_frames, other.num_frames)
         apart = other.pos[1:count].astype(np.float64) - self.first.pos[1:count]
-        return float(np.sqrt(np.mean(np.sum(apart**2, axis=-1)))) if count > 1 else 0.0
+        return float(np.sqrt(np.mean(np.sum(apart**2, axis=-1)))) if count > 1 else math.nan
 
     def write(self, path: Path | str) -> Path:
         """Write a viewer (.html), a figure (.png, .svg, .pdf), an animation (.gif, .mp4), or arrays (.npz); returns the path.

@@ -49,6 +49,8 @@ CLOSEST = 0.3
 """Smallest distance of nodes of two bodies [spacings]."""
 OF_ONE_DENSITY = ("mpm", "flip")
 """Solvers that take the volume of a node from its mass at the density of the data, so another mass would be another volume."""
+TAKEN = ("solver", "ground truth", "prediction")
+"""Names of rollouts of a film that no model has."""
 SHIPPED = {"sand": "sand", "snow": "snow", "elastomer": "elastomer", "fluid": "fluid", "solid": "fem"}
 """Shipped model of each material, which a scene takes if none is named."""
 
@@ -297,6 +299,8 @@ class Scene:
             SceneFault: the scene is impossible, or does not fit the model.
         """
         own = simulator.builder.metadata
+        if any(own.periodic):
+            raise SceneFault({"model": "is for a periodic domain; scenes have walls"})
         if own.dim != self.dim:
             raise SceneFault({"box": f"has {self.dim} axes, the model is for {own.dim}D"}, self)
         if not self.filled:
@@ -332,6 +336,8 @@ class Scene:
         simulator = self.model_for(chosen)
         state, metadata = self.state(simulator)
         num_frames, name = max(2, round(seconds / metadata.frame_dt)), model_name(chosen, ".")
+        if name in TAKEN:
+            name = f"model {name}"
         rollouts: dict[str, Trajectory] = {}
         if with_solver:
             solver = self.solver_of(simulator)

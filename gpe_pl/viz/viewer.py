@@ -136,7 +136,9 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
     shown = {name: _inside(t.frames(0, truth.num_frames)) for name, t in trajectories.items()}
     raster = Raster.of([t.pos[::stride] for t in shown.values()], np.asarray(about.bounds, float))
     colorings = {by: Coloring(by, [*shown.values()], frames, shown[first], by_node=True) for by in _colors(shown)}
-    steps = {by: _step(by, colorings[by], shown, frames) for by in ("speed", "von_mises") if by in colorings}
+    largest = {by: _largest(by, colorings[by], shown, frames) for by in ("speed", "von_mises") if by in colorings}
+    tops = {by: float(min(value, FASTEST * colorings[by].scale.vmax)) or 1.0 for by, value in largest.items()}  # type: ignore[operator]
+    steps = {by: top / (LEVELS - 1) for by, top in tops.items()}
     codes = np.unique(truth.node_type).tolist()
     vertical = vertical_axis(truth)
     apart = (
@@ -164,6 +166,7 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
         "colors": [_color(by, coloring, apart["name"]) for by, coloring in colorings.items()],
         "apart": apart,
         "steps": steps,
+        "cut": [by for by, top in tops.items() if top < largest[by]],
         "trajectories": [],
         **_focus(truth),
     }
@@ -246,12 +249,10 @@ class Raster:
         return np.where(outside[..., None], LEVELS, np.nan_to_num(level)).astype(np.uint16)
 
 
-def _step(by: ColorBy, coloring: Coloring, trajectories: Mapping[str, Trajectory], frames: Sequence[int]) -> float:
-    """Return the difference of neighbouring 16-bit values of a quantity."""
+def _largest(by: ColorBy, coloring: Coloring, trajectories: Mapping[str, Trajectory], frames: Sequence[int]) -> float:
+    """Return the largest finite value of a quantity in all frames."""
     values = [coloring.values(t, f)[0] for t in trajectories.values() for f in frames if f < t.num_frames]
-    finite = [v[np.isfinite(v)].max(initial=0.0) for v in values]
-    top = min(max(finite), FASTEST * coloring.scale.vmax)  # type: ignore[operator]
-    return float(top if top > 0 else 1.0) / (LEVELS - 1)
+    return float(max(v[np.isfinite(v)].max(initial=0.0) for v in values))
 
 
 def _levels(values: Float[np.ndarray, "frame node"], step: float) -> UInt16[np.ndarray, "frame node"]:

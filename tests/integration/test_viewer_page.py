@@ -143,7 +143,7 @@ def test_a_colour_bar_marks_values_above_its_end(opened: Any) -> None:
     truth = falling(2)
     vel = np.ones_like(truth.vel)
     vel[3, 0] = 50.0
-    viewer = opened(replace(truth, vel=vel))
+    viewer = opened(replace(truth, vel=vel), GPE=falling(2, noise=0.3))
     viewer.page.select_option("#color", "speed")
     assert viewer.page.locator(".bar").inner_text().split("\n") == ["0 m/s", "speed", "≥ 1.41 m/s"]
 
@@ -200,6 +200,27 @@ def test_the_mouse_finds_a_node_in_every_panel_and_turns_a_scene(opened: Any) ->
     assert (viewer.picture() != before).any(axis=-1).mean() > 0.02
     viewer.page.mouse.move(1, 1)
     viewer.page.click("#reset")
+
+
+@pytest.mark.slow
+def test_the_mouse_says_at_least_where_a_stored_value_is_cut(opened: Any) -> None:
+    truth = falling(2)
+    vel = truth.vel.copy()
+    vel[8, 12] = [0.0, -1e7]
+    viewer = opened(replace(truth, vel=vel), GPE=falling(2, noise=0.3))
+    stage = viewer.page.locator("#stage").bounding_box()
+
+    def speeds(frame: int) -> list[str]:
+        """Return what the tooltips of nodes say about the speed."""
+        viewer.page.locator("#frame").fill(str(frame))
+        found = []
+        for row, column in viewer.colored(0)[::40]:
+            viewer.page.mouse.move(float(column), float(row + stage["y"]))
+            found += [line.strip() for line in viewer.page.locator("#tooltip").inner_text().splitlines() if "speed" in line]
+        return found
+
+    assert {text.startswith("speed ≥") for text in speeds(8)} == {False, True}
+    assert {text.startswith("speed ≥") for text in speeds(7)} == {False}
 
 
 @pytest.fixture(params=[2, 3], ids=["2d", "3d"])

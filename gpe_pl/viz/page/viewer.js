@@ -405,7 +405,9 @@ class Viewer {
       if (!pos) continue;
       for (const { by, name, unit } of scene.colors) {
         const value = by in scene.steps || by === "error" ? this.#quantity(of, by)?.(node) : undefined;
-        if (value !== undefined && !Number.isNaN(value)) lines.push(`   ${name} ${withUnit(value, unit)}`);
+        if (value === undefined || Number.isNaN(value)) continue;
+        const atLeast = scene.cut.includes(by) && value >= (MISSING - 1) * scene.steps[by] ? "≥ " : "";  // larger values are stored as the largest one
+        lines.push(`   ${name} ${atLeast}${withUnit(value, unit)}`);
       }
     }
     return lines.join("\n");

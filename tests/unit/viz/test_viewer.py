@@ -89,6 +89,9 @@ def test_what_exploded_is_left_out_and_takes_no_precision(tmp_path, ground_truth
     missing = np.isnan(shown).all(axis=-1)
     assert missing[5, 0] and missing[6, 1] and missing.sum() == 2
     assert rounding < 1e-5 and page.scene["steps"]["speed"] <= FASTEST * vel.shape[-1] / 65534
+    assert page.scene["cut"] == ["speed"]
+    write_viewer(tmp_path / "b.html", ground_truth)
+    assert Page(tmp_path / "b.html").scene["cut"] == []
     about, count = page.scene["trajectories"][1], ground_truth.num_nodes
     assert about["rmse"][4] == about["rmse"][5] == 0.0
     assert about["notes"][4:7] == ["", f"1 of {count} nodes are missing", f"1 of {count} nodes are outside"]
