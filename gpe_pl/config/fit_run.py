@@ -37,7 +37,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.least_distance import distance_in
 from gpe_pl.learned.pretrained import fingerprint
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.learned.transfer import check_model, keep_rollout_settings
+from gpe_pl.learned.transfer import check_model, keep_rollout_settings, keep_trained_ranges
 from gpe_pl.models.lookup import model_class
 from gpe_pl.reports.finished_runs import Run, rollout_errors, table_of
 from gpe_pl.rollout.loop import Restartable
@@ -191,8 +191,12 @@ class FitRun:
             best = self.folder / "checkpoints" / "best.ckpt"
             best.parent.mkdir(parents=True, exist_ok=True)
             simulator = self._new_module(self.training).simulator
+            chosen = simulator.least_distance
             if self.start is not None:
                 keep_rollout_settings(simulator, self.start)
+                keep_trained_ranges(simulator, self.start)
+            if self.training.least_distance is not None:
+                simulator.least_distance = chosen
             simulator.save(best)
             return best
         module, is_trained = self._new_module(self.training), self.start is not None

@@ -18,6 +18,7 @@ import numpy as np
 from gpe_pl.data.control_runs import HIGHEST, LOWEST, NEAREST, ControlRuns, TrainedValues, Values, scene_values, with_values
 from gpe_pl.data.ground_truth import DatasetSpec, parameter_values
 from gpe_pl.errors import GpeError
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import displacement
 from gpe_pl.rollout.loop import Simulator, Start, rollouts
 from gpe_pl.schema import Split
@@ -87,6 +88,19 @@ class MaterialControls:
                 "material parameters, so there is nothing to compare; choose a larger data.num_train, or false"
             )
         self._runs.generate(self._indices, num_workers, on_progress)
+
+    def check_trained(self, simulator: LearnedSimulator) -> None:
+        """Raise ``ControlError`` if the trained values of these controls have another range than those with which a model was trained."""
+        trained = TrainedValues(self.trained)
+        ends = [trained.end(name) for name in (LOWEST, HIGHEST)]
+        for material, known in simulator.trained_ranges():
+            for k, parameter in enumerate(simulator.builder.spec.parameters[material]):
+                own = [end[material][parameter.name] for end in ends if parameter.name in end.get(material, {})]
+                if own and not np.allclose(own, known[:, k].tolist(), rtol=1e-5):
+                    raise ControlError(
+                        f"evaluation.material_controls=true: the model was trained with {parameter.name} of {material} from {known[0, k]:g} to "
+                        f"{known[1, k]:g}, and the train split of these data has {own[0]:g} to {own[1]:g}; choose the data settings of its training, or false"
+                    )
 
     def predictions(self, simulator: Simulator, starts: Sequence[Start], numbers: Sequence[int]) -> list[dict[str, Trajectory]]:
         """Return the model's rollouts of each scene, by name in ``CONTROLS``.

@@ -13,6 +13,7 @@ from gpe_pl.evaluation.metric_rows import LEARNED, Row
 from gpe_pl.evaluation.predictions import PredictedScene
 from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.learned import bands
+from gpe_pl.learned.pretrained import FOLDER
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.unlike import UnlikeScenes, trained_limits
 from gpe_pl.schema import Split
@@ -77,13 +78,19 @@ class Uncertainty:
             yield from self.coverage.add(scene, self.horizons, about)
 
     def finish(self, folder: Path) -> None:
-        """Store the bands beside the checkpoint, or write the table and the figure of coverage into the folder of the evaluation. Log warnings.
+        """Store the bands beside the checkpoint (those of a shipped model in the folder of the evaluation), or write table and figure of coverage there. Log
+        warnings.
 
         Raises:
             CalibrationError: there are too few scenes.
         """
         if self.calibration is not None:
             path = bands.path_beside(self.checkpoints)
+            if path.parent == FOLDER:
+                path = folder / path.name
+                log.warning(
+                    "the bands that come with the shipped model stay in use; for others, copy the checkpoint and calibrate the copy"
+                )
             bands.write(path, self.calibration.bands(self.checkpoints))
             print(path)
             return

@@ -13,7 +13,8 @@ counts is covered.
 Both hold on average over calibration sets, for one frame at a time and not for all frames at once. They do not hold for scenes unlike the calibration scenes.
 
 ``python -m gpe_pl.evaluate … calibrate=true`` stores bands beside a checkpoint as ``{stem}.bands.json``, and those of an ensemble beside its first checkpoint
-as ``{stem}.ensemble_of_{K}.bands.json``. The file holds the checksums of the checkpoints, so bands of other checkpoints are never used. It is plain JSON.
+as ``{stem}.ensemble_{digest of the checkpoints}.bands.json``. The file holds the checksums of the checkpoints, so bands of other checkpoints are never used.
+It is plain JSON.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, field
+from hashlib import sha256
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -211,8 +213,9 @@ def rounded_up(value: float) -> float:
 
 def path_beside(checkpoints: Sequence[Path | str]) -> Path:
     """Return the path of the bands of a model, or of an ensemble."""
-    first = checkpoint_path(checkpoints[0])
-    several = f".ensemble_of_{len(checkpoints)}" if len(checkpoints) > 1 else ""
+    first, several = checkpoint_path(checkpoints[0]), ""
+    if len(checkpoints) > 1:  # ensembles of the same first member keep their own bands
+        several = ".ensemble_" + sha256(" ".join(checksum(checkpoint_path(c)) for c in checkpoints).encode()).hexdigest()[:8]
     return first.with_name(f"{first.stem}{several}.bands.json")
 
 

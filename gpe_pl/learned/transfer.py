@@ -100,6 +100,18 @@ def keep_rollout_settings(new: LearnedSimulator, trained: LearnedSimulator) -> N
     new.least_distance = trained.least_distance * new.builder.metadata.spacing / trained.builder.metadata.spacing
 
 
+def keep_trained_ranges(new: LearnedSimulator, trained: LearnedSimulator) -> None:
+    """Give a simulator that is not trained the ranges of the trained one, so that values outside them are still outside. Materials that are new keep theirs."""
+    before, known = dict(trained.trained_ranges()), [*trained.builder.spec.materials]
+    for k, (material, values) in enumerate(new.trained_ranges()):
+        if material in known:
+            new.trained_mass[:, k] = trained.trained_mass[:, known.index(material)]
+            if _parameters(new, material) == _parameters(trained, material):
+                values.copy_(before[material])
+    if new.trained_scene.shape == trained.trained_scene.shape:
+        new.trained_scene.copy_(trained.trained_scene)
+
+
 def source_materials(materials: Sequence[str], trained: Sequence[str]) -> dict[str, str]:
     """Return for each material the trained one whose weights it takes: itself, else the first of its kind (with a mesh or without), else the first."""
     chosen = {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 
 from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.reports.finished_runs import Run, rollout_errors, splits_of, values_by_seed
@@ -11,8 +11,8 @@ from gpe_pl.reports.finished_runs import Run, rollout_errors, splits_of, values_
 FREE_FLIGHT = "ballistic"
 """Baseline in which every node falls freely until it touches a wall."""
 REMARKS = {
-    "fraction_corrected": (0.01, "containment corrected {:.2g} % of the particle-steps"),
-    "fraction_outside_at_end": (0.0, "{:.2g} % of the nodes end in walls"),
+    "fraction_corrected": (0.01, "containment corrected {:.3g} % of the particle-steps"),
+    "fraction_outside_at_end": (0.0, "{:.3g} % of the nodes end in walls"),
 }
 """Fractions that are mentioned above a limit, with the words for their percentage."""
 
@@ -27,12 +27,17 @@ def outcomes(run: Run) -> Iterator[str]:
         (errors,) = rollout_errors([run], split, "full")
         shared = sorted(errors.keys() & flight[0].keys())
         own, trivial = (sum(values[k] for k in shared) / max(1, len(shared)) for values in (errors, flight[0]))
-        failed = sum(not math.isfinite(value) for value in exact[0].values())
+        finished = {k for k, value in exact[0].items() if math.isfinite(value)}
+        failed = len(exact[0]) - len(finished)
+        if not finished:
+            yield f"{split}: all {failed} rollouts failed"
+            continue
+        counted = ", and count as free flight" if failed else ""
         yield "; ".join(
             [
                 f"{split}: full-horizon error {_compared(own, trivial)}",
-                f"{failed} of {len(exact[0])} rollouts failed",
-                *_remarks(run, split),
+                f"{failed} of {len(exact[0])} rollouts failed{counted}",
+                *_remarks(run, split, finished),
             ]
         )
 
@@ -46,10 +51,11 @@ def _compared(own: float, trivial: float) -> str:
     )
 
 
-def _remarks(run: Run, split: str) -> Iterator[str]:
+def _remarks(run: Run, split: str, finished: Container[int]) -> Iterator[str]:
+    """Yield remarks on the rollouts with these numbers."""
     for metric, (limit, words) in REMARKS.items():
         for horizon in ("full", ""):
             for values in values_by_seed([run], LEARNED, split, metric, horizon):
-                known = [value for value in values.values() if math.isfinite(value)]
+                known = [value for k, value in values.items() if math.isfinite(value) and k in finished]
                 if known and (mean := sum(known) / len(known)) > limit:
                     yield words.format(100 * mean)

@@ -14,6 +14,7 @@ eigenvalue of the Laplacian ``Σ V Gᵀ G`` in the metric of the nodal masses. A
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,6 +26,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import eigsh
 
 from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.trajectory.cells import bodies
 from gpe_pl.trajectory.state import Stress
 from gpe_pl.trajectory.strain import SMALLEST_RATIO, deformation_gradients, neo_hookean_density, shape_gradients
 
@@ -58,6 +60,8 @@ class Mesh:
     edges: np.ndarray
     averaging: csr_array
 
+
+log = logging.getLogger(__name__)
 
 MAX_CACHED = 512
 """Largest number of meshes kept in memory; one of 400 triangles takes about 0.1 MB. Training with targets of the solver returns to the meshes of all scenes."""
@@ -99,6 +103,11 @@ def _build_mesh(rest_bytes: bytes, rest_shape: tuple[int, int], cell_bytes: byte
     num_nodes, dim = rest_shape
     kind = CELLS[dim, cell_shape[1]]
     _require_sound(cells, num_nodes)
+    if (count := len(bodies(cells, num_nodes))) > 1:  # once per mesh, as the result is cached
+        log.warning(
+            "the mesh has %d bodies, which the finite element solver lets pass through each other: contact between them is not computed",
+            count,
+        )
     gradient, weight = shape_gradients(rest_pos[cells])
     flat = ~np.all(weight > 0, axis=1)
     if np.any(flat) or not np.all(np.isfinite(gradient)):

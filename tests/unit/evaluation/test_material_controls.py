@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from gpe_pl.config.datasets import dataset_spec
+from gpe_pl.data.control_runs import HIGHEST, LOWEST, TrainedValues
+from gpe_pl.data.ground_truth import trajectory_metadata
 from gpe_pl.evaluation import split_files
 from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, ControlError, MaterialControls, label_of
 from gpe_pl.evaluation.metric_rows import Row
@@ -122,3 +124,17 @@ def test_data_without_unseen_scenes_are_refused(controls: MaterialControls) -> N
 def test_a_single_trained_value_is_refused(controls: MaterialControls) -> None:
     with pytest.raises(ControlError, match=r"all trajectories \(1\) in the train split of sand have the same material parameters"):
         replace(controls, trained=replace(controls.trained, num_train=1)).prepare()
+
+
+def test_values_that_the_model_was_not_trained_with_are_no_trained_values(controls: MaterialControls) -> None:
+    builder = GraphBuilder(GraphConfig(history=1), trajectory_metadata(controls.trained, "train", 0))
+    simulator = LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=4), builder)
+    (trained,) = (values for _, values in simulator.trained_ranges())
+    ends = [TrainedValues(controls.trained).end(name)["sand"]["friction_angle"] for name in (LOWEST, HIGHEST)]
+    trained.copy_(torch.tensor(ends)[:, None])
+    controls.check_trained(simulator)
+    trained[1] += 1.0
+    with pytest.raises(
+        ControlError, match="the model was trained with friction_angle of sand from .* and the train split of these data has"
+    ):
+        controls.check_trained(simulator)

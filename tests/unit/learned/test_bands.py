@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -125,7 +126,10 @@ def test_bands_survive_the_file(checkpoint: Path, tmp_path: Path) -> None:
     bands.write(path, stored)
     assert path.name == "best.bands.json" and bands.read(own) == stored
     assert stored.features == {"speed": (0.0, 18.0)}
-    assert bands.path_beside([own, own]).name == "best.ensemble_of_2.bands.json"
+    other = tmp_path / "other.ckpt"
+    other.write_bytes(b"x")
+    ensembles = {bands.path_beside(members).name for members in ([own, own], [own, other], [other, own], [own, own, other])}
+    assert len(ensembles) == 4 and all(re.fullmatch(r"(best|other)\.ensemble_[0-9a-f]{8}\.bands\.json", name) for name in ensembles)
     values = json.loads(path.read_text())
     values["nodes"]["0.9"][0] = 0.0
     path.write_text(json.dumps(values))

@@ -13,7 +13,7 @@ from torch import Tensor
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
-from gpe_pl.learned.transfer import keep_rollout_settings, source_materials
+from gpe_pl.learned.transfer import keep_rollout_settings, keep_trained_ranges, source_materials
 from gpe_pl.models.base import LayersError
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
@@ -152,6 +152,12 @@ def test_a_model_that_is_not_trained_keeps_its_rollout_settings() -> None:
     assert (new.static_friction, new.mirror_average, new.least_distance) == (0.0, False, 0.0)
     keep_rollout_settings(new, trained)
     assert (new.static_friction, new.mirror_average, new.least_distance) == (0.3, True, 0.02)
+    for k, each in enumerate((trained, new)):
+        dict(each.trained_ranges())["sand"].copy_(torch.tensor([[20.0 + 20 * k], [40.0 + 20 * k]]))
+        each.trained_mass.copy_(torch.tensor([[1.0 + k], [2.0 + k]]))
+    keep_trained_ranges(new, trained)
+    assert dict(new.trained_ranges())["sand"].tolist() == [[20.0], [40.0]]
+    assert new.trained_mass.tolist() == [[1.0], [2.0]]
     without_islands = simulator(scenes.metadata(("sand",)), config=GraphConfig(history=1))
     keep_rollout_settings(without_islands, trained)
     assert without_islands.static_friction == 0.0 and without_islands.least_distance == 0.01

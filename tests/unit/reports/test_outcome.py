@@ -26,7 +26,15 @@ def run(learned: list[float], flight: list[float], **fractions: float) -> Run:
     ("made", "line"),
     [
         (run([1.0, 3.0], [10.0, 14.0]), "test: full-horizon error 6 times below free flight; 0 of 2 rollouts failed"),
-        (run([2.0, math.inf], [10.0, 14.0]), "test: full-horizon error 1.5 times below free flight; 1 of 2 rollouts failed"),
+        (
+            run([2.0, math.inf], [10.0, 14.0]),
+            "test: full-horizon error 1.5 times below free flight; 1 of 2 rollouts failed, and count as free flight",
+        ),
+        (run([math.inf, math.inf], [10.0, 14.0], fraction_outside_at_end=1.0), "test: all 2 rollouts failed"),
+        (
+            run([math.inf, 2.0], [10.0, 14.0], fraction_outside_at_end=1.0),  # of the failed one
+            "test: full-horizon error 2 times below free flight; 1 of 2 rollouts failed, and count as free flight",
+        ),
         (run([30.0], [10.0]), "test: full-horizon error 3 times ABOVE free flight, so the model is of no use here; 0 of 1 rollouts failed"),
         (
             run([1.0], [2.0], fraction_corrected=0.02, fraction_outside_at_end=0.001),
