@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,11 @@ DEPTHS = ("num_message_passing_steps", "num_propagation_steps", "num_convolution
 
 NOT_IN_LABELS = ("training.num_steps", "training.val_interval", "training.budget_minutes", "training.num_val_rollouts")
 """Settings that labels leave out: the length of the training, and how often and on what it is validated."""
+HOW_VALIDATED = ("training.val_interval", "training.num_val_rollouts")
+TRAINS = ("model.", "graph.", "training.", "data.", "start_from")
+"""Prefixes of settings on which a trained model depends, besides the seed."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,8 @@ def trained_on(
     """Return simulators that were trained on a data set of this name and size, and their runs, by label.
 
     A label names the model, its stride if that is not 1, and the settings of training and graph in which its runs differ, without those in
-    ``NOT_IN_LABELS``. Of runs with the same label, such as runs with other seeds, the first is returned.
+    ``NOT_IN_LABELS``. Of runs with the same label, such as runs with other seeds, the first is returned. A warning names the others, except those that differ
+    in their seed alone.
 
     Args:
         spec: the data set.
@@ -134,7 +141,9 @@ def trained_on(
         axes = [axis for axis in axes if all(run.config.get(axis) is not None for run in these)]  # others follow from these
         for simulator, run in members:
             differences = [f"{axis.rpartition('.')[2]}={run.config.get(axis)}" for axis in axes]
-            found.setdefault(", ".join([label, *differences]), (simulator, run))
+            _, kept = found.setdefault(", ".join([label, *differences]), (simulator, run))
+            if unlike := [axis for axis in axes_of([kept, run]) if axis.startswith(TRAINS) and axis not in HOW_VALIDATED]:
+                log.warning("%s: left out, because its label is that of %s; they differ in %s", run.folder, kept.folder, ", ".join(unlike))
     return found
 
 

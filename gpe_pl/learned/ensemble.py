@@ -66,12 +66,14 @@ class LearnedEnsemble(Ensemble):
         return LearnedEnsemble(tuple(member.on(scene) for member in self.members))
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
-        """Do the same as ``LearnedSimulator.initial_state``."""
-        return self.members[0].initial_state(trajectory, frame)
+        """Do the same as ``LearnedSimulator.initial_state``. Every member warns of what is outside its own training."""
+        first, *_ = [member.initial_state(trajectory, frame) for member in self.members]
+        return first
 
     def standing(self, state: State, scene: Metadata) -> State:
-        """Do the same as ``LearnedSimulator.standing``."""
-        return self.members[0].standing(state, scene)
+        """Do the same as ``LearnedSimulator.standing``. Every member warns of what is outside its own training."""
+        first, *_ = [member.standing(state, scene) for member in self.members]
+        return first
 
 
 def _fit(one: LearnedSimulator, other: LearnedSimulator) -> bool:

@@ -24,7 +24,8 @@ log = logging.getLogger(__name__)
 
 EVALUATIONS_MD = "table.md"
 NOT_IN_LABELS = ("data", "split", "graph.history", "evaluation.material_controls", "evaluation.num_pictures")
-"""Prefixes of configuration keys that labels leave out."""
+"""Prefixes of configuration keys that labels leave out, except that of the stride, at which a model of several scales may be evaluated."""
+STRIDE = "data.stride"
 
 Labelled = dict[tuple[str, str], dict[str, Run]]
 """Evaluations by domain and split, then by label."""
@@ -52,7 +53,7 @@ def labelled(runs: Sequence[Run]) -> Labelled:
     groups: Labelled = {}
     for domain in dict.fromkeys(str(run.config["data.name"]) for run in runs):
         own = [run for run in runs if run.config["data.name"] == domain]
-        axes = [axis for axis in axes_of(own) if not axis.startswith(NOT_IN_LABELS)]
+        axes = [axis for axis in axes_of(own) if axis == STRIDE or not axis.startswith(NOT_IN_LABELS)]
         for run in own:
             values = {axis.rpartition(".")[2]: run.config.get(axis) for axis in axes}
             label = ", ".join(f"{name}={value}" for name, value in values.items()) or str(run.config["checkpoint"]).partition(".ckpt")[0]

@@ -327,8 +327,9 @@ def _validation(datamodule: TrajectoryDataModule, training: TrainingSettings) ->
     validated = datamodule.val_trajectories(training.num_val_rollouts)
     lengths = [min(training.val_rollout_steps, t.num_frames - datamodule.builder.config.history - 1) for t in validated]
     if min(lengths) < max(lengths):
+        unlike = "strides" if len({t.metadata.frame_dt for t in validated}) > 1 else "lengths"
         log.warning(
-            "validation rollouts have %d to %d frames, because scenes of the split val have unlike lengths", min(lengths), max(lengths)
+            "validation rollouts have %d to %d frames, because scenes of the split val have unlike %s", min(lengths), max(lengths), unlike
         )
     return RolloutValidation(validated, max(lengths), training.val_containment)
 

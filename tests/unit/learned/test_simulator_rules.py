@@ -8,6 +8,7 @@ import torch
 from gpe_pl.learned.checkpoint_file import CheckpointError
 from gpe_pl.learned.ensemble import LearnedEnsemble
 from gpe_pl.learned.simulator import LearnedSimulator, PrecisionError
+from gpe_pl.scenes.scene import Scene
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -28,3 +29,13 @@ def test_members_of_an_ensemble_fit_each_other() -> None:
     with pytest.raises(CheckpointError, match="member 1 has other materials, frames, spacing or history than member 0"):
         LearnedEnsemble((sand, snow))
     assert len(LearnedEnsemble((sand, sand)).members) == 2
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_every_member_of_an_ensemble_warns_of_what_it_was_not_trained_on(order: tuple[int, int], caplog: pytest.LogCaptureFixture) -> None:
+    members = [LearnedSimulator.from_checkpoint("sand") for _ in range(2)]
+    dict(members[0].trained_ranges())["sand"][1] = 60.0
+    ensemble = LearnedEnsemble(tuple(members[k] for k in order))
+    scene, metadata = Scene(box=(1.0, 1.0)).block("sand", at=(0.3, 0.0), size=(0.1, 0.1), friction_angle=50).state(members[0])
+    ensemble.standing(scene, metadata)
+    assert "friction_angle of sand is 50 deg, trained were 20 to 42.5" in caplog.text

@@ -29,6 +29,7 @@ def write_evaluation(
     split: str = UNSEEN,
     seed: int = 0,
     history: int = 2,
+    stride: int = 1,
 ) -> None:
     """Write an evaluation whose errors are those of ``HARD`` times a factor, with controls if ``nearest`` is above 0."""
     folder.mkdir(parents=True)
@@ -37,7 +38,7 @@ def write_evaluation(
         "checkpoint": f"{data}.ckpt (sha256 0123)",
         "split": split,
         "data_sha256": {split: f"{data}{seed}"},
-        "data": {"name": data, "seed": seed, "parameters": parameters, "solver": {"frame_dt": 0.01}},
+        "data": {"name": data, "seed": seed, "parameters": parameters, "solver": {"frame_dt": 0.01}, "stride": stride},
         "graph": {"history": history},
         "evaluation": {"static_friction": friction},
     }
@@ -119,6 +120,13 @@ def test_a_repeated_evaluation_counts_once(tmp_path: Path, caplog: pytest.LogCap
     (group,) = labelled(evaluations_below(tmp_path)).values()
     assert [run.folder.name for run in group.values()] == ["b"]  # it has more rows
     assert f"{tmp_path / 'a'} repeats {tmp_path / 'b'} and is left out" in caplog.text
+
+
+def test_evaluations_of_a_model_at_two_strides_are_two(tmp_path: Path) -> None:
+    write_evaluation(tmp_path / "a", "sand", 1.0)
+    write_evaluation(tmp_path / "b", "sand", 2.0, stride=2)
+    (group,) = labelled(evaluations_below(tmp_path)).values()
+    assert list(group) == ["stride=1", "stride=2"]
 
 
 def test_training_runs_and_evaluations_are_told_apart(tmp_path: Path) -> None:

@@ -367,7 +367,7 @@ def test_meshes_of_many_scenes_are_prepared_once():
 
 def test_two_bodies_are_told_once_because_they_pass_through_each_other(caplog: pytest.LogCaptureFixture) -> None:
     square, triangles = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.1], [0.0, 0.1]]), np.array([[0, 1, 2], [0, 2, 3]])
-    two = np.concatenate([square, square + [0.3, 0.0]])
+    two = np.concatenate([square, square + np.array([0.3, 0.0])])
     for _ in range(2):
         build_mesh(two, np.concatenate([triangles, triangles + 4]), np.ones(8))
     assert caplog.text.count("the mesh has 2 bodies, which the finite element solver lets pass through each other") == 1

@@ -367,7 +367,9 @@ def test_what_gates_is_the_shipped_configuration(spec: DatasetSpec, scenes: list
 
 
 @pytest.mark.slow
-def test_runs_of_one_model_are_told_apart_by_their_training(spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path) -> None:
+def test_runs_of_one_model_are_told_apart_by_their_training(
+    spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     def made(name: str, model: Subject, **training: Any) -> Run:
         model.simulator.save(tmp_path / name / "checkpoints" / "best.ckpt")
         config = {"data.name": spec.name, "size.name": spec.size, "seed": len(name), "training.num_steps": len(name)}
@@ -386,6 +388,12 @@ def test_runs_of_one_model_are_told_apart_by_their_training(spec: DatasetSpec, s
         "GPE 2 × 8 geometry angular, velocity_noise_of_change=0.3": "bb",
         "GPE 2 × 8 geometry angular, velocity_noise_of_change=0.0": "ccc",
     }
+    assert (
+        f"{tmp_path / 'dddd'}: left out, because its label is that of {tmp_path / 'ccc'}; they differ in training.num_steps" in caplog.text
+    )
+    caplog.clear()
+    trained_on(spec, [runs[0], replace(runs[0], config={**runs[0].config, "seed": 7})])
+    assert not caplog.text  # another seed is expected
 
 
 def test_two_checkpoints_of_one_name_are_an_error(spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path) -> None:
