@@ -22,6 +22,8 @@ Solid = Literal["inside", "outside", "below"]
 
 _BAND = 2
 """Width of the band around a triangle in which distances are exact [cells]. Nodes farther away take the nearest triangle of a neighbouring node."""
+SAME_POINT = 1e-7
+"""Distance below which corners of triangles are the same point, as a fraction of the size of the mesh. Files have single precision."""
 MAX_PAIRS = 2**30
 """Maximum number of pairs of a triangle and a nearby grid node. Computing that many distances takes about half a minute."""
 
@@ -82,11 +84,12 @@ def mesh_distances(corners: np.ndarray, low: np.ndarray, spacing: float, counts:
         rim = distance_transform_edt(~covered, return_distances=False, return_indices=True)
         top = top[tuple(rim)]
         z = low[2] + spacing * np.arange(counts[2])
-        inside = np.where(covered[..., None], above % 2 == 1, z < top[..., None])
+        inside = np.where(covered[..., None], enclosed(above, is_oriented(corners)), z < top[..., None])
         full = covered[:-1, :-1] & covered[1:, :-1] & covered[1:, 1:] & covered[:-1, 1:]
         corners = np.concatenate([corners, _ground(top, low, spacing, ~full)])
     else:  # a majority of three rays decides, so that a crack which one ray passes through does no harm
-        votes = sum((_crossings(corners, low, spacing, counts, axis)[0] % 2).astype(int) for axis in range(3))
+        oriented = is_oriented(corners)
+        votes = sum(enclosed(_crossings(corners, low, spacing, counts, axis)[0], oriented).astype(int) for axis in range(3))
         inside = (np.asarray(votes) >= 2) == (solid == "inside")
     return np.where(inside, -1.0, 1.0) * unsigned(corners, low, spacing, counts)
 
@@ -134,8 +137,36 @@ def _num_pairs(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tup
     return float((np.floor(np.clip(place.max(axis=1) + _BAND, 0.0, last)) - first + 1).prod(axis=1).sum())
 
 
+def is_oriented(faces: np.ndarray) -> bool:
+    """Tell whether every edge of a face is that of another face in the other direction, as in closed meshes whose faces all look outwards.
+
+    Args:
+        faces: corners of triangles [triangle, 3, 3], or ends of segments [segment, 2, 2], whose edges are their ends.
+    """
+    points = faces.reshape(-1, faces.shape[-1])
+    size = max(float(np.ptp(points, axis=0).max(initial=0.0)), 1e-300)
+    _, number = np.unique(np.round((points - points.min(axis=0)) / (SAME_POINT * size)), axis=0, return_inverse=True)
+    number = number.reshape(faces.shape[:2])
+    if faces.shape[1] == 2:
+        return bool(np.array_equal(np.sort(number[:, 0]), np.sort(number[:, 1])))
+    start, end = number.ravel(), np.roll(number, -1, axis=1).ravel()
+    there, back = (a[start != end] * (number.max() + 1) + b[start != end] for a, b in ((start, end), (end, start)))
+    return bool(np.array_equal(np.sort(there), np.sort(back)))
+
+
+def enclosed(crossings: np.ndarray, oriented: bool) -> np.ndarray:
+    """Return whether points are inside a surface, given the sums of the signs of its crossings beyond them.
+
+    Where parts of an oriented surface overlap, the sum is 2 or more. Without an orientation only its parity counts, and there such a place is outside.
+    """
+    return np.asarray(crossings != 0 if oriented else crossings % 2 == 1)
+
+
 def _crossings(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...], axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of triangles beyond each grid node along an axis, and the last crossing on each line of nodes [m] (-inf: none)."""
+    """Return the sum of the signs of the triangles beyond each grid node along an axis, and the last crossing on each line of nodes [m] (-inf: none).
+
+    The sign is that of a triangle's normal along the axis. The sum is odd if the number of triangles is.
+    """
     order = [(axis + 1) % 3, (axis + 2) % 3, axis]
     hits = np.zeros([counts[k] for k in order], dtype=np.int64)
     last = np.full(hits.shape[:2], -np.inf)
@@ -240,7 +271,7 @@ def _spread(triangles, origin, spacing, distance, nearest):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _cast(triangles, origin, spacing, hits, last):
-    """Count the triangles that cross the line along the third axis between each node and the next one (after the last node: anywhere).
+    """Add the signs of the triangles that cross the line along the third axis between each node and the next one (after the last node: anywhere).
 
     The last crossing of each line is written to ``last``.
 
@@ -268,4 +299,4 @@ def _cast(triangles, origin, spacing, hits, last):
                 z = u * az + v * bz + w * cz
                 last[i, j] = max(last[i, j], origin[2] + z * spacing)
                 if z > 0.0:
-                    hits[i, j, _node(math.ceil(z) - 1.0, nz)] += 1
+                    hits[i, j, _node(math.ceil(z) - 1.0, nz)] += 1 if area > 0.0 else -1
