@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -20,12 +21,12 @@ from gpe_pl.export.compiled_program import export_compiled
 from gpe_pl.export.program import scene_of
 
 
-def prepare(simulator: LearnedSimulator, start: State, folder: Path) -> None:
-    """Write ``model.pt2`` and ``scene.pt`` of a model of one material, for a state with velocity history in a box."""
+def prepare(simulator: LearnedSimulator, start: State, bounds: Sequence[tuple[float, float]], folder: Path) -> None:
+    """Write ``model.pt2`` and ``scene.pt`` of a model of one material, for a state with velocity history in a box with these ``(low, high)`` per axis [m]."""
     folder.mkdir(parents=True, exist_ok=True)
     own, builder = simulator.builder.metadata, simulator.builder
     export_compiled(simulator, folder / "model.pt2", [start, simulator.step(start)])
-    low, high = torch.tensor(own.bounds, dtype=torch.float64).T
+    low, high = torch.tensor(bounds, dtype=torch.float64).T
     about = {
         "low": low.contiguous(),
         "high": high.contiguous(),
@@ -38,4 +39,5 @@ def prepare(simulator: LearnedSimulator, start: State, folder: Path) -> None:
 if __name__ == "__main__":
     model = LearnedSimulator.from_checkpoint(sys.argv[1])
     scene = Scene(box=(1.0, 1.0)).block(model.builder.spec.materials[0], at=(0.1, 0.0), size=(0.2, 0.4))
-    prepare(model, model.standing(*scene.state(model)), Path(sys.argv[2]))
+    state, metadata = scene.state(model)
+    prepare(model, model.standing(state, metadata), metadata.bounds, Path(sys.argv[2]))

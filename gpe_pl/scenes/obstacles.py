@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,9 @@ from gpe_pl.geometry.sections import section, solid_within
 from gpe_pl.geometry.shapes import DistanceGrid, Shape, Sphere
 from gpe_pl.geometry.terrain import Up, turned
 from gpe_pl.geometry.terrain_files import Mesh, TerrainError, read_surface
+from gpe_pl.geometry.thin_parts import thinnest
+
+log = logging.getLogger(__name__)
 
 FRICTION = 0.4
 """Coulomb coefficient of walls and obstacles for which none is given."""
@@ -70,7 +74,10 @@ class MeshObstacle:
         try:
             if len(bounds) == 2:
                 middle = float((vertices[:, 1].min() + vertices[:, 1].max()) / 2)
-                return solid_within(section(vertices[source.faces], middle), bounds, step, self.friction)
+                outlines = section(vertices[source.faces], middle)
+                self._warn_of_thin_parts(outlines, step)
+                return solid_within(outlines, bounds, step, self.friction)
+            self._warn_of_thin_parts(vertices[source.faces], step)
             origin = np.array([a - step for a, _ in bounds])
             counts = tuple(int(np.ceil((b - a) / step)) + 3 for a, b in bounds)
             values = mesh_distances(vertices[source.faces], origin, step, counts, "inside")
@@ -80,3 +87,16 @@ class MeshObstacle:
         except ValueError as error:
             reach = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(vertices.min(axis=0)[axes], vertices.max(axis=0)[axes], strict=True))
             raise TerrainError(f"{self.path}: reaches from {reach} m; {error}; give at=… and size=… in m") from None
+
+    def _warn_of_thin_parts(self, faces: np.ndarray, step: float) -> None:
+        thickness, place = thinnest(faces) if len(faces) else (np.inf, np.zeros(0))
+        if thickness < step:
+            where = ", ".join(f"{x:.3g}" for x in place)
+            log.warning(
+                "%s: a part of it near (%s) m is %.2g m thick, and this scene resolves %.2g m (half of the spacing), so nodes may pass through it; thicken it, "
+                "or give a box or polygon",
+                self.path,
+                where,
+                thickness,
+                step,
+            )

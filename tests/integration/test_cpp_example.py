@@ -43,7 +43,7 @@ def test_the_example_moves_particles_as_python_does(tmp_path: Path) -> None:
     before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", True)  # lengths are symbols during export
     try:
-        example.prepare(learned, state, tmp_path)
+        example.prepare(learned, state, learned.builder.metadata.bounds, tmp_path)
     finally:
         jaxtyping.config.update("jaxtyping_disable", before)
     prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"

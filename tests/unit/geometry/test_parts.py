@@ -7,6 +7,7 @@ import pytest
 
 from gpe_pl.geometry.grid_distance import is_oriented, mesh_distances
 from gpe_pl.geometry.sections import section, solid_within
+from gpe_pl.geometry.thin_parts import thinnest
 
 FACES = np.array(
     [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4], [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6], [1, 3, 5], [3, 7, 5]]
@@ -53,3 +54,21 @@ def test_faces_that_look_to_different_sides_still_enclose(inside) -> None:
 def test_an_open_mesh_is_not_oriented() -> None:
     assert not is_oriented(box(0.2, 0.6)[1:])
     assert is_oriented(section(box(0.2, 0.6), 0.5)) and not is_oriented(section(box(0.2, 0.6), 0.5)[1:])
+
+
+def outline(corners: list[tuple[float, float]]) -> np.ndarray:
+    """Return the segments of a polygon whose corners run clockwise, so that free space is to their left."""
+    points = np.array(corners)
+    return np.stack([points, np.roll(points, -1, axis=0)], axis=1)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_thickness_is_that_of_the_thinnest_part(turned: bool) -> None:
+    foot = [(0.4, 0.0), (0.6, 0.0), (0.6, 0.03), (0.503, 0.03), (0.503, 0.4), (0.497, 0.4), (0.497, 0.03), (0.4, 0.03)]
+    found, place = thinnest(outline(foot[::-1] if turned else foot))
+    assert found == pytest.approx(0.006, rel=1e-6) and 0.497 <= place[0] <= 0.503
+    square = [(0.0, 0.0), (0.3, 0.0), (0.3, 0.2), (0.0, 0.2)]
+    assert thinnest(outline(square))[0] == pytest.approx(0.2)
+    cube, plate = box(0.2, 0.6), box(0.2, 0.6) * np.array([1.0, 1.0, 0.02])
+    faces = cube[:, ::-1] if turned else cube
+    assert thinnest(faces)[0] == pytest.approx(0.4) and thinnest(plate)[0] == pytest.approx(0.008)
