@@ -143,7 +143,7 @@ def test_a_colour_bar_marks_values_above_its_end(opened: Any) -> None:
     truth = falling(2)
     vel = np.ones_like(truth.vel)
     vel[3, 0] = 50.0
-    viewer = opened(replace(truth, vel=vel), GPE=falling(2, noise=0.3))
+    viewer = opened(replace(truth, vel=vel))
     viewer.page.select_option("#color", "speed")
     assert viewer.page.locator(".bar").inner_text().split("\n") == ["0 m/s", "speed", "≥ 1.41 m/s"]
 

@@ -86,7 +86,7 @@ def test_an_image_is_a_body_where_it_is_dark(tmp_path: Path) -> None:
 def test_an_image_of_16_bits_is_that_of_8_and_other_ranges_are_refused(tmp_path: Path) -> None:
     pixels = np.full((40, 40), 255, np.uint8)
     pixels[:20], pixels[20:30] = 0, 40
-    images = {
+    images: dict[str, np.ndarray] = {
         "8.png": pixels,
         "16.png": pixels.astype(np.uint16) * 257,
         "f.tiff": pixels.astype(np.float32) / 255,
