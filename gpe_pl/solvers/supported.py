@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gpe_pl.rollout.loop import SimulationError
-from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.boundary import Boundary, has_nodes_beside_shapes
 from gpe_pl.trajectory.state import State
+
+NEAR = 0.01
+"""Distance from a shape up to which a node may be of it rather than of the nearest one, as a fraction of the size of the boundary."""
 
 
 def check_surroundings(state: State, solver: str, computes_open_scenes: bool = False) -> None:
@@ -38,6 +41,41 @@ def check_surroundings(state: State, solver: str, computes_open_scenes: bool = F
             "or use Boundary.sample",
             reason="input",
         )
+    if (conflict := _conflict(b)) is not None:
+        raise SimulationError(f"{solver} takes walls and obstacles from the shapes of the boundary, and {conflict}", reason="input")
+
+
+MOST_CHECKED = 256
+"""Number of boundaries whose comparison with their shapes is remembered. Every step of a scene has the same one."""
+_checked: dict[int, tuple[Boundary, str | None]] = {}
+
+
+def _conflict(boundary: Boundary) -> str | None:
+    """Return in which way the nodes of a boundary are not those of its shapes; None if they are. Models read the nodes."""
+    if (known := _checked.get(id(boundary))) is not None and known[0] is boundary:
+        return known[1]
+    found = _compared(boundary) if len(boundary.pos) else None
+    while len(_checked) >= MOST_CHECKED:
+        _checked.pop(next(iter(_checked)))
+    _checked[id(boundary)] = boundary, found
+    return found
+
+
+def _compared(boundary: Boundary) -> str | None:
+    shapes = boundary.shapes
+    if any(shape.restitution != 0 for shape in shapes):
+        return "a shape has restitution, which it does not compute"
+    if has_nodes_beside_shapes(boundary):
+        return "some of its nodes are on none of them; pass a shape for each, or use Boundary.sample"
+    pos, friction = np.asarray(boundary.pos, np.float64), np.asarray(boundary.friction, np.float64)
+    distance = np.abs([shape.signed_distance(pos) for shape in shapes])
+    near = distance <= distance.min(axis=0) + NEAR * float(np.ptp(pos, axis=0).max())  # a node in a corner is on two walls
+    alike = np.isclose(np.array([[shape.friction] for shape in shapes]), friction, rtol=1e-5, atol=1e-6)
+    wrong = np.flatnonzero(~(near & alike).any(axis=0))
+    if len(wrong):
+        own = shapes[int(distance[:, wrong[0]].argmin())].friction
+        return f"its boundary_node {wrong[0]} has the friction {friction[wrong[0]]:g}, the shape there {own:g}; give both the same"
+    return None
 
 
 def _moves(boundary: Boundary) -> bool:
