@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpe_pl.geometry.shape_values import shape_fault
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.trajectory.boundary import Boundary, has_nodes_beside_shapes
 from gpe_pl.trajectory.state import State
@@ -62,7 +63,9 @@ def _conflict(boundary: Boundary) -> str | None:
 
 
 def _compared(boundary: Boundary) -> str | None:
-    shapes = boundary.shapes
+    shapes, dim = boundary.shapes, boundary.pos.shape[-1]
+    if any(shape_fault(shape, dim) for shape in shapes):
+        return None  # solvers name these
     if any(shape.restitution != 0 for shape in shapes):
         return "a shape has restitution, which it does not compute"
     if has_nodes_beside_shapes(boundary):
