@@ -78,9 +78,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         with without_orphans(folder):
             try:
                 start_frame = settings.first_frame(simulator.builder.config.history, scene.frame_dt)
-                controls = material_controls(cfg, settings, root, start_frame)
-                if controls is not None:
-                    controls.check_trained(simulator)
+                controls = material_controls(cfg, settings, root, start_frame, simulator)
                 uncertainty = Uncertainty(
                     checkpoints, simulator.on(scene), settings, cfg.split, split_checksum(root, cfg.split), cfg.calibrate
                 )

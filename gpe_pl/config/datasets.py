@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gpe_pl.data.ground_truth import DatasetSpec
     from gpe_pl.evaluation.material_controls import MaterialControls
     from gpe_pl.evaluation.settings import EvaluationSettings
+    from gpe_pl.learned.simulator import LearnedSimulator
     from gpe_pl.trajectory.trajectory import Metadata
 
 IMPORTED = "imported"
@@ -281,11 +282,13 @@ def check_material_controls(cfg: DictConfig, settings: EvaluationSettings) -> No
         raise ConfigError(f"evaluation.material_controls=true: needs data that this package simulates; data={IMPORTED} has no solver")
 
 
-def material_controls(cfg: DictConfig, settings: EvaluationSettings, root: Path, start_frame: int) -> MaterialControls | None:
+def material_controls(
+    cfg: DictConfig, settings: EvaluationSettings, root: Path, start_frame: int, simulator: LearnedSimulator | None = None
+) -> MaterialControls | None:
     """Return the rollouts with other material parameters that an evaluation on the data in ``root`` compares with, or None if the settings want none.
 
-    Missing runs of the solver are computed. ``start_frame`` counts frames of the model, each of which has ``data.stride`` stored frames. Errors are those of
-    ``MaterialControls.prepare``.
+    Missing runs of the solver are computed, after a check that the trained values are those of ``simulator``, if it is given. ``start_frame`` counts frames of
+    the model, each of which has ``data.stride`` stored frames. Errors are those of ``MaterialControls.prepare`` and ``check_trained``.
     """
     from gpe_pl.evaluation.material_controls import MaterialControls
     from gpe_pl.system.progress import progress_bar
@@ -295,6 +298,8 @@ def material_controls(cfg: DictConfig, settings: EvaluationSettings, root: Path,
     evaluated = evaluated_config(cfg)
     spec = dataset_spec(evaluated)
     controls = MaterialControls(root, spec, dataset_spec(cfg), start_frame, settings.num_trajectories, stride_of(evaluated))
+    if simulator is not None:
+        controls.check_trained(simulator)
     with progress_bar(f"{spec.name} {spec.size} controls") as on_progress:
         controls.prepare(os.cpu_count() or 1, on_progress)
     return controls

@@ -11,6 +11,9 @@ from gpe_pl.trajectory.state import State
 
 NEAR = 0.01
 """Distance from a shape up to which a node may be of it rather than of the nearest one, as a fraction of the size of the boundary."""
+MOST_CHECKED = 256
+"""Number of boundaries whose comparison with their shapes is remembered. Every step of a scene has the same one."""
+_checked: dict[int, tuple[Boundary, str | None]] = {}
 
 
 def check_surroundings(state: State, solver: str, computes_open_scenes: bool = False) -> None:
@@ -44,11 +47,6 @@ def check_surroundings(state: State, solver: str, computes_open_scenes: bool = F
         )
     if (conflict := _conflict(b)) is not None:
         raise SimulationError(f"{solver} takes walls and obstacles from the shapes of the boundary, and {conflict}", reason="input")
-
-
-MOST_CHECKED = 256
-"""Number of boundaries whose comparison with their shapes is remembered. Every step of a scene has the same one."""
-_checked: dict[int, tuple[Boundary, str | None]] = {}
 
 
 def _conflict(boundary: Boundary) -> str | None:

@@ -263,3 +263,15 @@ def test_a_model_at_another_scale_has_the_horizons_of_its_scene(tmp_path: Path) 
         here = simulator.at(frame_dt=factor * metadata().frame_dt)
         seen = Uncertainty([str(tmp_path / "own.ckpt")], here, EvaluationSettings(horizons=[0.1]), "test", "abc")
         assert [*seen.horizons] == [frame]
+
+
+def test_bands_of_a_shipped_model_are_not_replaced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    shipped = bands.path_beside(["sand"])
+    before, sand = shipped.read_bytes(), LearnedSimulator.from_checkpoint("sand")
+    found = Uncertainty(["sand"], sand, EvaluationSettings(horizons=[0.1]), "test", "abc", calibrate=True)
+    assert found.calibration is not None
+    for k in range(9):
+        found.calibration.add(scene(k))
+    found.finish(tmp_path)
+    assert shipped.read_bytes() == before and (tmp_path / "sand.bands.json").is_file()
+    assert "the bands that come with the shipped model stay in use" in caplog.text

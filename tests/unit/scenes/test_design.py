@@ -54,6 +54,13 @@ def test_impossible_designs_are_refused_in_one_line(seek: Callable[[], Any], mes
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_scene_that_the_solver_refuses_is_told_before_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gpe_pl.evaluation.design.guidance.Guidance.misfit", lambda *_: pytest.fail("the search began"))
+    heavy = Scene(box=(1.0, 1.0)).block("sand", at=(0.1, 0.5), size=(0.1, 0.1), density=1500).obstacle(Circle((0.6, 0.3), 0.1))
+    with pytest.raises(verb.DesignFault, match=r"solve=true: .*computes with 1600 kg/m³ only.*; or give solve=false"):
+        design(heavy, (0.8, 0.1), shift=0.05, angle=0.0)
+
+
 def test_a_design_has_the_scale_of_its_scene() -> None:
     """Models of one scale refuse another spacing, as in predictions."""
     other = scene()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,13 @@ def test_numbers_of_numpy_are_numbers(kind: Any) -> None:
     scene = Scene(box=box).block("sand", at=(0.1, 0.0), size=(0.2, 0.2), friction_angle=kind(30), density=kind(1500))
     state, _ = scene.state(model("sand"))
     assert (state.material_params == 30.0).all()
+
+
+def test_a_model_of_a_periodic_domain_is_refused() -> None:
+    simulator = model("sand").configured()
+    simulator.builder = replace(simulator.builder, metadata=replace(simulator.builder.metadata, periodic=(True, False)))
+    with pytest.raises(SceneFault, match="model: is for a periodic domain; scenes have walls"):
+        Scene(box=(1.0, 1.0)).block("sand", at=(0.1, 0.0), size=(0.2, 0.2)).state(simulator)
 
 
 def test_a_polygon_is_a_body_in_either_direction() -> None:
