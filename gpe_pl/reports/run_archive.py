@@ -1,8 +1,8 @@
 """Archive of many runs: two small files from which tables can be made again after the folders of the runs are deleted.
 
 ``runs.json`` has the configurations and validation curves. Values that all or several runs have are said once.
-``rollouts.csv.xz`` has one line per run, model, split and trajectory, and one column per metric and horizon, such as ``rollout_mse@full``. Values have six
-significant digits; metrics of single-precision rollouts have no more.
+``rollouts.csv.xz`` has one line per run, model, split and trajectory, and one column per metric and horizon, such as ``rollout_mse@full``. Values have five
+significant digits; tables and intervals print three.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gpe_pl.files import sealed
 from gpe_pl.files.atomic import replacing
 
 RUNS, ROLLOUTS = "runs.json", "rollouts.csv.xz"
-NUMBER = "{:.6g}"
+NUMBER = "{:.5g}"
 KEYS = ["model", "split", "trajectory", "parameter_group", "parameter"]
 COLUMNS = [*KEYS, "metric", "horizon", "value"]
 """Columns of a run's rows, as in ``metrics.csv``."""
@@ -55,7 +55,7 @@ def write_archive(folder: Path, runs: dict[str, dict[str, Any]], rows: dict[str,
 
 
 def read_archive(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, pd.DataFrame]]:
-    """Read an archive. Returns the arguments ``runs`` and ``rows`` of ``write_archive``, with values to six digits.
+    """Read an archive. Returns the arguments ``runs`` and ``rows`` of ``write_archive``, with values to five digits.
 
     Raises:
         ArchiveError: a file is damaged or does not belong to the other.
