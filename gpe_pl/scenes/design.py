@@ -150,7 +150,7 @@ def design(
     limits = (shift, shift, 0.0 if isinstance(shape, Sphere) else math.radians(angle))
     if not any(limits):
         raise DesignFault(f"shift=0: {name} is a disc, which does not turn; give a shift of more than 0")
-    movable.check_limits(limits, state.boundary, state.pos, metadata.spacing)
+    movable.check_limits(limits, state.boundary, state.pos, metadata.spacing, state.cells)
     num_frames, goal = max(1, round(seconds / metadata.frame_dt)), np.asarray(target, np.float64)
     start, solver = simulator.standing(state, metadata), _solver(scene, simulator) if solve else None
     guidance = Guidance(simulator, start, movable, limits, goal, num_frames, failed=(4 * metadata.longest_side) ** 2)

@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 
 from gpe_pl.errors import GpeError
 from gpe_pl.errors.printable import did_you_mean
+from gpe_pl.geometry.mesh_points import in_mesh
 from gpe_pl.geometry.shape_values import shape_fault
 from gpe_pl.geometry.shapes import Shape, domain_walls, signed_distance
 from gpe_pl.geometry.terrain import Up
@@ -512,13 +513,15 @@ class Scene:
         return float(own[body.material] if isinstance(own, dict) else own)
 
     def _check_contacts(self, found: Mapping[str, Nodes], shapes: Mapping[str, Shape], spacing: float, faults: dict[str, str]) -> None:
-        """Find nodes in obstacles, and bodies that overlap."""
+        """Find nodes in obstacles, obstacles in meshes, and bodies that overlap."""
         trees: dict[str, cKDTree] = {}
         for name, nodes in found.items():
             for obstacle, shape in shapes.items():
                 depth = -signed_distance((shape,), nodes.pos)
                 if (depth > 0).any():
                     faults[name] = f"{int((depth > 0).sum())} of its {len(nodes.pos)} nodes are inside {obstacle}; move one of the two"
+                elif in_mesh(shape.sample(spacing)[0], nodes.pos, nodes.cells).any():  # a plate thinner than the spacing
+                    faults[name] = f"{obstacle} passes through it between its nodes; move one of the two"
             for other, tree in trees.items():
                 distance, _ = tree.query(nodes.pos)
                 if distance.min() < CLOSEST * spacing:

@@ -12,6 +12,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from gpe_pl.errors import GpeError
+from gpe_pl.geometry.mesh_points import in_mesh
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, signed_distance
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
@@ -82,7 +83,9 @@ class Obstacle:
         shapes = tuple(shape if own == self.shape else own for own in boundary.shapes)
         return replace(state, boundary=replace(boundary, pos=pos, normal=normal, shapes=shapes))
 
-    def check_limits(self, limits: Sequence[float], boundary: Boundary, pos: np.ndarray, spacing: float) -> None:
+    def check_limits(
+        self, limits: Sequence[float], boundary: Boundary, pos: np.ndarray, spacing: float, cells: np.ndarray | None = None
+    ) -> None:
         """Check that the obstacle can take every pose within limits.
 
         Args:
@@ -90,19 +93,22 @@ class Obstacle:
             boundary: boundary of the scene, as arrays.
             pos: positions of nodes at the start [node, 2].
             spacing: rest spacing of nodes [m].
+            cells: cells of meshes [cell, corner], if there are any.
 
         Raises:
-            PoseError: at some pose it touches a wall, another obstacle or a node; the message names the pose.
+            PoseError: at some pose it touches a wall, another obstacle, a node or a mesh; the message names the pose.
         """
         others = tuple(other for other in boundary.shapes if other != self.shape)
         reach = float(np.linalg.norm(_corners(self.shape) - self.centre, axis=1).max())
-        cells = [(np.zeros(3), np.asarray(limits, np.float64))]  # middle and half widths of sets of poses
-        while cells:
-            pose, half = cells.pop()
+        sets = [(np.zeros(3), np.asarray(limits, np.float64))]  # middle and half widths of sets of poses
+        while sets:
+            pose, half = sets.pop()
             shape = self.moved_shape(pose.tolist())
             points, _ = shape.sample(spacing)
             to_walls = float(signed_distance(others, points).min()) if others else math.inf
             to_nodes = float(shape.signed_distance(pos).min(initial=math.inf))
+            if cells is not None and in_mesh(points, pos, cells).any():
+                to_nodes = 0.0
             if min(to_walls, to_nodes) <= 0:
                 touched = "a wall or another obstacle" if to_walls <= 0 else "the material"
                 raise PoseError(f"shift, angle: at {text(pose.tolist())} the obstacle touches {touched}; choose smaller limits, or move it")
@@ -110,7 +116,7 @@ class Obstacle:
             if math.hypot(moves[0], moves[1]) + moves[2] > max(min(to_walls, to_nodes), CLOSEST * spacing):
                 is_widest = np.arange(3) == int(moves.argmax())
                 step, smaller = np.where(is_widest, half / 2, 0.0), np.where(is_widest, half / 2, half)
-                cells += [(pose - step, smaller), (pose + step, smaller)]
+                sets += [(pose - step, smaller), (pose + step, smaller)]
 
 
 def text(pose: Sequence[float]) -> str:

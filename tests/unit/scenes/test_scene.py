@@ -166,6 +166,11 @@ def test_a_section_of_a_tetrahedron_is_a_triangle() -> None:
     assert solid.signed_distance(np.array([[0.1, 0.1], [0.6, 0.6]])) == pytest.approx([-0.1, 0.35 * 2**0.5], abs=2e-3)
 
 
+def plate_through_a_solid() -> Scene:
+    """Return a plate much thinner than the spacing that passes between nodes."""
+    return Scene(box=(1.0, 1.0)).block("solid", (0.3, 0.3), (0.2, 0.2)).obstacle(Box((0.2, 0.3801), (0.6, 0.3804), 0.3))
+
+
 FAULTS: list[tuple[Callable[[], Any], str]] = [
     (lambda: Scene(box=(1.0,)), "box: must have 2 or 3 sides [m], or (low, high) for each axis, such as (1.5, 1.0), got (1.0,)"),
     (lambda: Scene(box=(1.0, 1.0), gravity=(0, 0, -1)), "gravity: gravity=(0, 0, -1): must be 2 numbers"),
@@ -198,6 +203,7 @@ FAULTS: list[tuple[Callable[[], Any], str]] = [
     (lambda: column().block("sand", (0.5, 0.5), (0.01, 0.3)).predict(), "block 2 (sand): is 0.01 m thin, less than the distance of nodes, 0.015625 m"),
     (lambda: column().block("sand", (0.15, 0.1), (0.3, 0.3)).predict(), "block 2 (sand): overlaps block 1 (sand); move one of the two"),
     (lambda: column().obstacle(Circle((0.2, 0.1), 0.05)).predict(), "block 1 (sand): 27 of its 128 nodes are inside obstacle 1; move one of the two"),
+    (lambda: plate_through_a_solid().predict(), "block 1 (solid): obstacle 1 passes through it between its nodes"),
     (lambda: column().obstacle(Circle((3.0, 0.5), 0.1)).predict(), "obstacle 1: no part of its surface is in the box; move it, or leave it out"),
     (lambda: column().obstacle(Box((0.5, 0.0, 0.0), (0.6, 0.1, 0.1), 0.4)).predict(), "obstacle 1: low must have 2 components"),
 ]  # fmt: skip

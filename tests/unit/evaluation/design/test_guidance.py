@@ -13,6 +13,7 @@ import torch
 from gpe_pl.evaluation.design.guidance import Guidance
 from gpe_pl.evaluation.design.pose import Obstacle, PoseError
 from gpe_pl.evaluation.identification.search import SearchSettings, search
+from gpe_pl.geometry.meshing import triangulate
 from gpe_pl.geometry.shapes import Box, Polygon, Sphere, Wall, domain_walls
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
@@ -97,6 +98,18 @@ def test_poses_that_touch_something_are_refused() -> None:
     assert (RAMP.signed_distance(beside) > 0).all()
     with pytest.raises(PoseError, match="touches the material"):
         obstacle.check_limits((0.0, 0.0, 1.5), own, beside, scenes.SPACING)
+
+
+def test_a_plate_that_passes_into_a_mesh_between_its_nodes_is_refused() -> None:
+    plate = Box((0.4, 0.5), (0.6, 0.501), 0.3)
+    own, (pos, cells) = (
+        boundary(plate),
+        triangulate([np.array([(0.7, 0.4), (0.9, 0.4), (0.9, 0.6), (0.7, 0.6)])], 0.04, np.random.default_rng(0)),
+    )
+    pos[:, 1] += 0.5005 - np.unique(pos[:, 1].round(2))[2] - 0.02  # no node is at the height of the plate
+    Obstacle.of(plate, own).check_limits((0.05, 0.0, 0.0), own, pos, 0.04, cells)
+    with pytest.raises(PoseError, match="touches the material"):
+        Obstacle.of(plate, own).check_limits((0.15, 0.0, 0.0), own, pos, 0.04, cells)
 
 
 def test_a_corner_that_touches_between_coarse_poses_is_found() -> None:
