@@ -116,7 +116,7 @@ class Coloring:
         # End at the 99th percentile: otherwise a single lost particle would take all contrast from the others. Particles and cells have one each, or a fine
         # mesh would hide the stress of a few particles.
         top = max(float(np.quantile(np.append(values, 0.0), 0.99)) for values in painted)
-        return Normalize(0.0, top if top > 0 else least)
+        return Normalize(0.0, top or max(float(values.max(initial=0.0)) for values in painted) or least)
 
     @property
     def bar_label(self) -> str | None:

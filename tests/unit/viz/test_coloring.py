@@ -34,6 +34,14 @@ def test_speed_is_the_length_of_the_velocity(ground_truth):
     assert coloring.scale.vmin == 0 and coloring.bar_label == "speed [m/s]"
 
 
+def test_one_moving_node_among_many_at_rest_sets_the_scale(ground_truth):
+    vel = np.zeros_like(ground_truth.vel)
+    vel[1, 3, :2] = 3.0, 4.0
+    coloring = Coloring("speed", [replace(ground_truth, vel=vel)], range(ground_truth.num_frames))
+    assert np.quantile(np.linalg.norm(vel, axis=2), 0.99) == 0
+    assert coloring.scale.vmax == pytest.approx(5.0) and not coloring.is_exceeded
+
+
 def test_stress_has_one_scale_for_all_rows(mesh):
     stiff = replace(mesh, stress=type(mesh.stress)(4 * mesh.stress.node, 4 * mesh.stress.cell))
     coloring = Coloring("von_mises", [mesh, stiff], range(mesh.num_frames))
