@@ -58,6 +58,16 @@ class Mesh:
     faces: np.ndarray
     watertight: bool
 
+    def why_not_closed(self) -> str:
+        """Return why the triangles enclose no volume, with a point of an edge in the file's coordinates."""
+        edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, count = np.unique(edges, axis=0, return_counts=True)
+        for is_bad, what in ((count == 1, "one triangle only, so the surface has holes"), (count > 2, "more than two triangles")):
+            if is_bad.any():
+                x, y, z = self.vertices[edges[is_bad][0]].mean(axis=0)
+                return f"{int(is_bad.sum())} of its edges, such as that at ({x:.3g}, {y:.3g}, {z:.3g}), belong to {what}"
+        return "its triangles look inwards and outwards"
+
 
 @dataclass(frozen=True)
 class Cloud:

@@ -61,8 +61,10 @@ class MeshObstacle:
             TerrainError: the file cannot be read, holds no closed mesh, or nothing of it is in the domain.
         """
         source = read_surface(self.path)
-        if not isinstance(source, Mesh) or not source.watertight:
-            raise TerrainError(f"{self.path}: encloses no volume; export it as a closed triangle mesh")
+        if not isinstance(source, Mesh):
+            raise TerrainError(f"{self.path}: is no triangle mesh; export it as one that encloses a volume")
+        if not source.watertight:
+            raise TerrainError(f"{self.path}: encloses no volume: {source.why_not_closed()}; export each closed part as a mesh of its own")
         axes = [0, 2] if len(bounds) == 2 else [0, 1, 2]
         vertices = turned(source.vertices, self.up)
         low, extent = vertices.min(axis=0), np.ptp(vertices, axis=0)

@@ -158,6 +158,19 @@ def test_a_mesh_is_an_obstacle_by_its_section(tmp_path: Path) -> None:
         column().obstacle(mesh=tmp_path / "part.stl").state(model("sand"))
 
 
+def test_a_mesh_that_encloses_no_volume_tells_why(tmp_path: Path) -> None:
+    pytest.importorskip("trimesh")
+    text = cube(tmp_path / "part.stl").read_text()
+    facets = text.split("facet normal")
+    (tmp_path / "open.stl").write_text("facet normal".join(facets[:-2]) + "endsolid cube")
+    with pytest.raises(SceneFault, match=r"encloses no volume: 4 of its edges, such as that at \(.*\), belong to one triangle only"):
+        column().obstacle(mesh=tmp_path / "open.stl", at=(0.5, 0.1), size=0.2).state(model("sand"))
+    fin = "facet normal 0 0 0\nouter loop\nvertex 10 10 10\nvertex 10 10 12\nvertex 5 5 11\nendloop\nendfacet\n"
+    (tmp_path / "fin.stl").write_text(text.replace("endsolid", fin + "endsolid"))
+    with pytest.raises(SceneFault, match=r"edges, such as that at \(.*\), belong to "):
+        column().obstacle(mesh=tmp_path / "fin.stl", at=(0.5, 0.1), size=0.2).state(model("sand"))
+
+
 def test_a_section_of_a_tetrahedron_is_a_triangle() -> None:
     a, b, c, d = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
     segments = section(np.array([[a, c, b], [a, b, d], [a, d, c], [b, c, d]]), 0.5)
