@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from gpe_pl.data.importers import deck, frd
-from gpe_pl.data.importers.meshes import add_to_nodes, check_intervals, sizes
+from gpe_pl.data.importers.meshes import add_to_nodes, between_frames, check_intervals, sizes
 from gpe_pl.data.importers.source import (
     Facts,
     ImportFailure,
@@ -103,7 +103,7 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
     prescribed = np.array([[axis in axes for axis in (1, 2, 3)] for axes in held])
     nodes.prescribed = prescribed if prescribed.any() else None
     force = conditions.force(results.node_ids, times, results.rest_pos, pos)
-    nodes.force = None if force is None else (force + np.concatenate([force[1:], force[-1:]])) / 2
+    nodes.force = None if force is None else between_frames(force)
     if (velocity := _frames(results, "VELO", count)) is not None:
         nodes.vel = np.concatenate([np.zeros((1, *velocity.shape[1:])), velocity])
     stress = _frames(results, "STRESS", count)

@@ -28,7 +28,7 @@ UNSEEN = {
     **dict.fromkeys(
         ("EQUATION", "MPC", "TIE", "COUPLING", "KINEMATIC", "DISTRIBUTING", "DISTRIBUTINGCOUPLING", "RIGIDBODY"), "couples nodes"
     ),
-    **dict.fromkeys(("CYCLICSYMMETRYMODEL", "CONTACTPAIR", "CONTACT", "GAP"), "couples nodes"),
+    **dict.fromkeys(("CYCLICSYMMETRYMODEL", "CONTACTPAIR", "CONTACT", "GAP", "PRE-TENSIONSECTION", "NETWORKMPC"), "couples nodes"),
     **dict.fromkeys(("SPRING", "DASHPOT", "MASS"), "adds forces or masses to nodes"),
     **dict.fromkeys(("INITIALCONDITIONS", "TEMPERATURE"), "moves or strains bodies without a force"),
     **dict.fromkeys(
@@ -40,6 +40,8 @@ UNSEEN = {
 """Cards that change the motion by what a trajectory cannot hold, and how."""
 READ_OF_LOADS, READ_OF_AMPLITUDES = {"AMPLITUDE", "OP"}, {"NAME", "TIME"}
 """Parameters of ``*CLOAD``, ``*DLOAD`` and ``*DSLOAD``, and of ``*AMPLITUDE``, that are read or change nothing. Others change when or where loads act."""
+RESULTS = ("NODEFILE", "ELFILE", "ELEMENTFILE", "NODEOUTPUT", "ELEMENTOUTPUT", "CONTACTFILE")
+"""Cards that say which results are written, and along which axes."""
 PROCEDURES = (
     "STATIC",
     "FREQUENCY",
@@ -190,6 +192,8 @@ def read(path: Path) -> Deck:
                 raise Refusal(f"{path.name}: *{keyword} is not read; give forces as *CLOAD and pressures as *DLOAD or *DSLOAD")
             elif squeezed in UNSEEN:
                 raise Refusal(f"{path.name}: *{keyword} {UNSEEN[squeezed]}, which a model would not see; compute the deck without it")
+            elif squeezed in RESULTS and parameters.get("GLOBAL", "YES") == "NO":
+                raise Refusal(f"{path.name}: *{keyword} with GLOBAL=NO writes results along local axes; leave GLOBAL out")
             elif keyword == "TRANSFORM":
                 raise Refusal(f"{path.name}: *TRANSFORM; give held axes and forces along the global axes")
             elif keyword == "INCLUDE":

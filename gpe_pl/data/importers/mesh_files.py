@@ -237,7 +237,7 @@ def _stored(grid: ElementTree.Element, part: str) -> bytes | None:
 
 
 def _exodus(path: Path) -> Iterator[tuple[float, Any]]:
-    """Yield times and meshes of an Exodus file [Schoof & Yarberry 1994]; meshio itself reads its first time only."""
+    """Yield times and meshes of an Exodus file [Schoof & Yarberry 1994]; meshio itself reads its first time only. Values that a block lacks are NaN."""
     import meshio
     import netCDF4
 
@@ -255,8 +255,11 @@ def _exodus(path: Path) -> Iterator[tuple[float, Any]]:
                 _grouped({name: values[key][t] for k, name in enumerate(of_cells, start=1) if (key := f"vals_elem_var{k}eb{b}") in values})
                 for b in blocks
             ]
-            everywhere = [name for name in (by_block[0] if by_block else ()) if all(name in own for own in by_block)]
-            cell_data = {name: [own[name] for own in by_block] for name in everywhere}
+            shapes = {name: own[name].shape[1:] for own in by_block for name in own}
+            cell_data = {
+                name: [own.get(name, np.full((len(rows), *shape), np.nan)) for own, (_, rows) in zip(by_block, cells, strict=True)]
+                for name, shape in shapes.items()
+            }
             yield float(time), meshio.Mesh(points, cells, point_data=point_data, cell_data=cell_data)
 
 

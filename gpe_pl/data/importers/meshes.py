@@ -87,10 +87,17 @@ def mean_at_nodes(rest_pos: np.ndarray, cells: Mapping[str, np.ndarray], values:
         for kind, own in highest.items():
             size = sizes(rest_pos, kind, own)
             here = without[own] * size[:, None]
-            np.add.at(total, own, here.reshape(*own.shape, *[1] * len(shape)) * values[kind][:, None])
+            weighted = here.reshape(*own.shape, *[1] * len(shape)) * values[kind][:, None]
+            weighted[here == 0] = 0.0  # also where cells that do not count have no value
+            np.add.at(total, own, weighted)
             np.add.at(weight, own, here)
             del left[kind]
     return np.asarray(total / np.where(weight > 0, weight, 1.0).reshape(-1, *[1] * len(shape)))
+
+
+def between_frames(force: Float[np.ndarray, "frame node dim"]) -> Float[np.ndarray, "frame node dim"]:
+    """Return the forces that act from each frame to the next, as means of those at both times. Programs write the forces at the time of a result."""
+    return (force + np.concatenate([force[1:], force[-1:]])) / 2
 
 
 def check_intervals(times: np.ndarray, facts: Facts, advice: str) -> None:

@@ -14,7 +14,7 @@ Arrays are found by their names. ``arrays={displacement: U, stress: S}`` names t
 - ``velocity`` of points [point, axis] in m/s. Without it, velocities are differences of positions.
 - ``stress`` of points or cells: 6 components in VTK's order XX, YY, ZZ, XY, YZ, XZ, or 9. The stress of a cell goes to its nodes, as the mean by size of cells.
 - ``prescribed`` of points: not 0 where the motion is given, or [point, axis] along which axes it is, as in the first frame.
-- ``force`` of points [point, axis] in N.
+- ``force`` of points [point, axis] in N at the times of the frames. From a frame to the next, the mean of both acts.
 - ``mass`` of points [kg], or ``density`` of points or cells [kg/m³] (in 2D kg/m²), with which cells of the highest dimension count. Otherwise all masses are
   1 kg, which does not suit forces.
 - ``material`` of points: numbers, which ``materials={1: elastomer}`` names. Without it, all have number 0, which is ``solid`` for meshes.
@@ -35,7 +35,15 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.data.importers.mesh_files import ENDINGS, Frame, read_series, times_of
-from gpe_pl.data.importers.meshes import add_to_nodes, check_intervals, mean_at_nodes, of_highest_dimension, sizes, without_faces
+from gpe_pl.data.importers.meshes import (
+    add_to_nodes,
+    between_frames,
+    check_intervals,
+    mean_at_nodes,
+    of_highest_dimension,
+    sizes,
+    without_faces,
+)
 from gpe_pl.data.importers.source import (
     Facts,
     ImportFailure,
@@ -127,7 +135,8 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
         if len(cells.get(kind, ())) < len(corners):
             nodes.notes.append(f"cells of kind {kind} whose corners all belong to one other cell of a higher dimension are left out")
     nodes.vel = _vectors(arrays, "velocity", dim)
-    nodes.force = _vectors(arrays, "force", dim)
+    force = _vectors(arrays, "force", dim)
+    nodes.force = None if force is None else between_frames(force)
     prescribed = arrays.of_points("prescribed")
     if prescribed is not None and prescribed[0].any():
         per_axis = prescribed[0].reshape(pos.shape[1], -1) != 0
@@ -164,6 +173,8 @@ def _positions(frames: list[Frame], arrays: _Arrays) -> tuple[np.ndarray, np.nda
     points = np.stack([_padded(frame.points) for frame in frames])
     moved = arrays.of_points("displacement")
     if moved is not None:
+        if moved.ndim != 3 or moved.shape[2] not in (2, 3):
+            raise Refusal(f"{arrays.name('displacement')!r} has shape {list(moved.shape[1:])}, expected [point, 2] or [point, 3]")
         moved = _padded(moved.reshape(*points.shape[:2], -1))
     if (points != points[:1]).any():
         return points, points[0] if moved is None else points[0] - moved[0]
@@ -190,11 +201,11 @@ def _vectors(arrays: _Arrays, role: str, dim: int) -> np.ndarray | None:
 
 
 def _add_masses(nodes: Nodes, arrays: _Arrays, rest: np.ndarray, cells: Mapping[str, np.ndarray]) -> None:
-    mass, density = arrays.of_points("mass"), arrays.at_points("density", rest)
+    mass, density = arrays.of_points("mass"), arrays.in_cells("density", cells)
     if mass is not None:
         nodes.mass = mass[0].reshape(-1)
     elif density is not None and cells:
-        own, total, filling = density[0].reshape(-1), np.zeros(len(rest)), of_highest_dimension(cells)
+        total, filling = np.zeros(len(rest)), of_highest_dimension(cells)
         kind = next(iter(filling))
         if (has := CELL_KINDS[kind][0]) != rest.shape[1]:
             raise Refusal(
@@ -202,7 +213,7 @@ def _add_masses(nodes: Nodes, arrays: _Arrays, rest: np.ndarray, cells: Mapping[
                 f"known; give masses of points as {arrays.name('mass')!r}"
             )
         for kind, rows in filling.items():
-            add_to_nodes(total, rows, own[rows].mean(axis=1) * sizes(rest, kind, rows) / rows.shape[1])
+            add_to_nodes(total, rows, density[kind] * sizes(rest, kind, rows) / rows.shape[1])
         if (total == 0).any():
             raise Refusal(
                 f"point {int((total == 0).argmax())} belongs to no cell of {has} dimensions, so it has no mass; leave it out or give {arrays.name('mass')!r}"
@@ -252,10 +263,30 @@ class _Arrays:
             values = frame.cell_data.get(name)
             whole = values is not None and {*values} >= {*frame.cells}
             found.append(mean_at_nodes(rest, frame.cells, values) if whole and values is not None else None)
+            if found[-1] is not None and np.isnan(found[-1]).any():
+                raise Refusal(f"{frame.file} has no {name!r} in some of its cells; write it in all blocks of cells")
         return self._stacked(role, found)
+
+    def in_cells(self, role: str, cells: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
+        """Return values of the cells of the highest dimension in the first frame by kind [cell], or the means of the values of their corners; None if there are
+        none. Means over the cells around nodes would be wrong where values jump.
+        """
+        first, name = self.frames[0], self.name(role)
+        of_points = self.of_points(role) if name in first.point_data or name not in first.cell_data else None
+        if of_points is not None:
+            return {kind: of_points[0].reshape(-1)[rows].mean(axis=1) for kind, rows in of_highest_dimension(cells).items()}
+        if name not in first.cell_data:
+            return None
+        self.at_points(role, first.points)  # refuses frames without it
+        return {kind: np.asarray(first.cell_data[name][kind], np.float64).reshape(-1) for kind in of_highest_dimension(cells)}
 
     def _stacked(self, role: str, found: list[Any]) -> np.ndarray | None:
         name = self.name(role)
+        later = next((frame.file for frame in self.frames[1:] if name in frame.point_data or name in frame.cell_data), None)
+        if found[0] is None and later is not None and not (name in self.frames[0].point_data or name in self.frames[0].cell_data):
+            raise Refusal(
+                f"{self.frames[0].file} has no array {name!r}, and {later} has one; write it in all frames, also where it is 0", 0
+            )
         if found[0] is None:
             if role in self.names:
                 raise Refusal(f"{self.frames[0].file} has no array {name!r} (arrays={{{role}: {name}}}); {self.there()}")

@@ -216,6 +216,13 @@ def test_damping_is_noted(tmp_path: Path) -> None:
     [
         (lambda d: d.replace("*DENSITY\n1200.\n", ""), str, "material RUBBER has no \\*DENSITY"),
         (
+            lambda d: d.replace("*NODE FILE", "*EL FILE, GLOBAL=NO\nS\n*NODE FILE"),
+            str,
+            r"\*EL FILE with GLOBAL=NO writes results along local axes",
+        ),
+        (lambda d: d.replace("*MATERIAL", "*PRE-TENSION SECTION, NODE=1\n*MATERIAL"), str, r"\*PRE-TENSION SECTION couples nodes"),
+        (lambda d: d.replace("*MATERIAL", "*NETWORK MPC, NODE=1\n*MATERIAL"), str, r"\*NETWORK MPC couples nodes"),
+        (
             lambda d: d.replace("GRAV, 9.81, 0., 0., -1.", "BX, 5."),
             str,
             "BX is no pressure on a face P1 to P6; give forces on nodes as \\*CLOAD",

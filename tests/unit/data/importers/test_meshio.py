@@ -90,7 +90,9 @@ def test_a_series_of_meshio_becomes_a_trajectory(tmp_path: Path, series: str) ->
     assert found.cells is not None and found.cells.tolist() == CELLS.tolist() and found.cell_dim == 3
     assert found.prescribed is not None and found.prescribed.tolist() == [[True] * 3] * 4 + [[False] * 3] * 8
     assert found.force is not None and found.stress is not None
-    np.testing.assert_allclose(found.force, force(), rtol=1e-6)
+    between = np.arange(FRAMES).clip(max=FRAMES - 1.5) + 0.5  # of a force that grows with time
+    between[-1] = FRAMES - 1
+    np.testing.assert_allclose(found.force[:, 8:, 1], -np.repeat(between[:, None], 4, axis=1), rtol=1e-6)
     np.testing.assert_allclose(found.mass, DENSITY * SIZE**3 / 8 * np.repeat([1, 2, 1], 4), rtol=1e-5)
     np.testing.assert_allclose(found.material_params[:, 0], np.repeat([1e5, 2e5, 3e5], 4), rtol=1e-5)
     of_cells = stress(2)
@@ -185,6 +187,34 @@ def test_exodus_with_all_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.stress.node[:, 0], stress(2)[:, 0][:, VTK], rtol=1e-5)
 
 
+def test_exodus_with_a_block_without_stress_is_refused(tmp_path: Path) -> None:
+    netcdf = pytest.importorskip("netCDF4")
+    (tmp_path / "raw").mkdir()
+    with netcdf.Dataset(tmp_path / "raw" / "beam.e", "w") as file:
+        for name, size in {"time_step": None, "node": len(POINTS), "cell": 1, "corner": 8, "len": 16, "n": 2, "e": 1}.items():
+            file.createDimension(name, size)
+        for k, axis in enumerate("xyz"):
+            file.createVariable(f"coord{axis}", "f8", ("node",))[:] = POINTS[:, k]
+        for block in (1, 2):
+            connect = file.createVariable(f"connect{block}", "i4", ("cell", "corner"))
+            connect.elem_type, connect[:] = "HEX8", CELLS[block - 1 : block] + 1
+        for key, names in (("n", ("disp_x", "disp_y")), ("e", ("density",))):
+            text = file.createVariable("name_nod_var" if key == "n" else "name_elem_var", "S1", (key, "len"))
+            for k, name in enumerate(names):
+                text[k] = [c.encode() for c in name.ljust(16, "\0")]
+        time = file.createVariable("time_whole", "f8", ("time_step",))
+        moved = [file.createVariable(f"vals_nod_var{k}", "f8", ("time_step", "node")) for k in (1, 2)]
+        density = file.createVariable("vals_elem_var1eb1", "f8", ("time_step", "cell"))
+        for frame in range(FRAMES):
+            time[frame], density[frame] = DT * frame, DENSITY
+            for k in range(2):
+                moved[k][frame] = displacement(POINTS)[frame, :, k]
+    with pytest.raises(ImportFailure, match=r"beam.e has no 'density' in some of its cells; write it in all blocks of cells"):
+        imported(tmp_path, arrays={"displacement": "disp"})
+    with pytest.raises(ImportFailure, match=r"'disp_y' has shape \[12\], expected \[point, 2\] or \[point, 3\]"):
+        imported(tmp_path, arrays={"displacement": "disp_y"})
+
+
 def test_cells_of_the_surface_add_no_mass_and_no_stress(tmp_path: Path) -> None:
     """Mesh generators write the triangles of the surface beside the tetrahedra."""
     corners = SIZE * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -225,6 +255,26 @@ def test_nodes_without_a_solid_have_the_mean_of_their_other_cells() -> None:
     cells = {"line": np.array([[1, 3], [0, 1]]), "triangle": np.array([[0, 1, 2]])}
     found = mean_at_nodes(points, cells, {"line": np.array([5.0, 7.0]), "triangle": np.array([2.0])})
     assert found.tolist() == [2.0, 2.0, 2.0, 5.0]
+
+
+def test_masses_jump_where_the_density_of_cells_does(tmp_path: Path) -> None:
+    def edit(mesh: Any, frame: int) -> Any:
+        mesh.cell_data["density"] = [np.array([DENSITY, 5 * DENSITY])]
+        return mesh
+
+    write_folder(tmp_path / "raw", edit)
+    found = imported(tmp_path, frame_dt=DT)
+    np.testing.assert_allclose(found.mass, DENSITY * SIZE**3 / 8 * np.repeat([1, 6, 5], 4), rtol=1e-5)
+
+
+def test_a_value_that_some_cells_lack_is_told(tmp_path: Path) -> None:
+    def edit(mesh: Any, frame: int) -> Any:
+        mesh.cell_data["S"][0][1] = np.nan
+        return mesh
+
+    write_folder(tmp_path / "raw", edit)
+    with pytest.raises(ImportFailure, match=r"step_0.vtu has no 'S' in some of its cells; write it in all blocks of cells"):
+        imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
 
 
 def test_surfaces_in_space_have_no_mass_by_density(tmp_path: Path) -> None:
@@ -303,9 +353,9 @@ def item(values: np.ndarray) -> str:
     return f'<DataItem DataType="{kind}" Dimensions="{values.shape[0]} {values.shape[1]}" Format="XML" Precision="8">{text}</DataItem>'
 
 
-def without(name: str, at: int = 0) -> Callable[[Any, int], Any]:
+def without(name: str, at: int = 0, until: int = FRAMES) -> Callable[[Any, int], Any]:
     def edit(mesh: Any, frame: int) -> Any:
-        if frame >= at:
+        if at <= frame < until:
             mesh.point_data.pop(name, None)
             mesh.cell_data.pop(name, None)
         return mesh
@@ -333,6 +383,9 @@ def flat_stress(mesh: Any, frame: int) -> Any:
     [
         (without("displacement"), r"step_0.vtu: points do not move, and there are no displacements; name them with arrays={displacement: .*'velocity'"),
         (without("S"), r"step_0.vtu has no array 'S' \(arrays={stress: S}\); point data: 'displacement'.*cell data: 'density'"),
+        (without("velocity", 0, 1), r"step_0.vtu has no array 'velocity', and step_1.vtu has one; write it in all frames"),
+        (without("S", 0, 1), r"step_0.vtu has no array 'S', and step_1.vtu has one; write it in all frames"),
+        (without("prescribed", 0, 2), r"step_0.vtu has no array 'prescribed', and step_2.vtu has one; write it in all frames"),
         (without("velocity", 4), r"step_4.vtu has no array 'velocity', step_0.vtu has one of shape \[12, 3\]"),
         (without("density"), r"has forces but no masses, and a model reads f/m; name them with arrays={mass: …} or arrays={density: …}"),
         (quadratic, r"step_0.vtu has cells of kind line3; cells must be linear: line, triangle"),
