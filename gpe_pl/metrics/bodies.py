@@ -172,7 +172,8 @@ def _contact_metrics(prediction: Bodies, truth: Bodies, until: int) -> dict[str,
         window[0] = False  # frame 0 is the shared start
         true = truth.von_mises[:until][window]
         if true.any():
-            values["contact_von_mises_error"] = float(np.linalg.norm(prediction.von_mises[:until][window] - true) / np.linalg.norm(true))
+            error = float(np.linalg.norm(prediction.von_mises[:until][window] - true) / np.linalg.norm(true))
+            values["contact_von_mises_error"] = error if math.isfinite(error) else math.inf
     return values
 
 
@@ -180,4 +181,5 @@ def _peak_stress(prediction: Bodies, truth: Bodies, until: int) -> dict[str, flo
     if prediction.von_mises is None or truth.von_mises is None:
         return {}
     peak, true = (float(stress[1:until].max()) for stress in (prediction.von_mises, truth.von_mises))
+    peak = math.inf if math.isnan(peak) else peak
     return {"peak_von_mises": peak} | ({"peak_von_mises_ratio": peak / true} if true > 0 else {})

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from gpe_pl.geometry.shapes import signed_distance
+from gpe_pl.trajectory.boundary import nodes_beside_shapes, search_tree
 from gpe_pl.trajectory.trajectory import Trajectory
 
 FARTHEST = 1.5
@@ -20,13 +21,17 @@ middle of an edge is half a spacing away from both nodes of the edge."""
 def boundary_gaps(trajectory: Trajectory, bodies: list[Int64[np.ndarray, "_"]]) -> Float[np.ndarray, "frame body"]:
     """Return the smallest distance [m] of the nodes of each body to walls and obstacles.
 
-    It is the signed distance to the shapes of a boundary. If the boundary moves or has no shapes, it is the distance to the nearest boundary node. Nodes whose
+    It is the signed distance to the shapes of a boundary, or the distance to a boundary node that belongs to none of them, if that is nearer. If the boundary
+    moves or has no shapes, it is the distance to the nearest boundary node. Nodes whose
     motion is given do not count, and neither do nodes in one cell with them, because a clamp at a wall is no contact. The gap is infinite without a boundary,
     and for a body without other nodes.
     """
     boundary, pos = trajectory.boundary, trajectory.pos.astype(np.float64)
     if boundary.shapes and boundary.motion is None:
         distance = signed_distance(boundary.shapes, pos)
+        loose = boundary.pos[nodes_beside_shapes(boundary)]
+        if len(loose):
+            distance = np.minimum(distance, search_tree(loose, trajectory.metadata.periodicity).query(pos)[0])
     elif len(boundary.pos):
         periodicity = trajectory.metadata.periodicity
         distance = np.stack([boundary.at(frame).tree(periodicity).query(x)[0] for frame, x in enumerate(pos)])

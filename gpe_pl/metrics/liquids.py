@@ -22,6 +22,8 @@ WHOLE = ("centre_error", "spread_error")
 """Metrics that are undefined in periodic domains."""
 KERNEL_SPACINGS = 2.0
 """Radius of the kernel that gives densities, in rest spacings."""
+NUM_GRIDS = 16
+"""Number of grids of boxes over which the volume is averaged."""
 MATERIAL = "fluid"
 
 
@@ -46,8 +48,14 @@ def density(pos: Float[np.ndarray, "node dim"], metadata: Metadata) -> Float[np.
 
 
 def volume(pos: Float[np.ndarray, "node dim"], metadata: Metadata) -> float:
-    """Return the volume [m^dim] of the boxes with an edge of one rest spacing that contain a node."""
-    return float(len(np.unique(np.floor(pos / metadata.spacing), axis=0)) * metadata.spacing**metadata.dim)
+    """Return the volume [m^dim] of the boxes with an edge of one rest spacing that contain a node, as the mean over several places of the boxes.
+
+    At one place alone, nodes near the faces of boxes would make a third of them empty by moves of any size.
+    """
+    space, edge = metadata.periodicity, metadata.spacing
+    shifts = edge * np.random.default_rng(0).random((NUM_GRIDS, metadata.dim))
+    counts = [len(np.unique(np.floor((space.from_corner(pos + shift) if space else pos + shift) / edge), axis=0)) for shift in shifts]
+    return float(np.mean(counts) * edge**metadata.dim)
 
 
 def liquid_metrics(

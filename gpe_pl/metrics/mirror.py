@@ -13,6 +13,7 @@ from jaxtyping import Float, Int64
 from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.shapes import signed_distance
+from gpe_pl.trajectory.boundary import nodes_beside_shapes
 from gpe_pl.trajectory.reflection import Reflection
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -43,11 +44,11 @@ def mirrors(truth: Trajectory) -> list[Mirror]:
     """Return the vertical planes about which a scene is symmetric.
 
     A scene is symmetric if its first frame equals its mirror image in positions, velocities, masses and materials, if given motions and forces do in all
-    frames, and if the walls and obstacles near nodes of any frame do. Mesh cells are not compared, because the diagonals of a lattice of triangles are rarely
-    symmetric. The list is empty in periodic domains, and if the boundary moves or has nodes but no shapes.
+    frames, and if the walls and obstacles near nodes of any frame do, with their friction and restitution. Mesh cells are not compared, because the diagonals
+    of a lattice of triangles are rarely symmetric. The list is empty in periodic domains, and if the boundary moves or has nodes that belong to no shape.
     """
     metadata, boundary = truth.metadata, truth.boundary
-    if any(metadata.periodic) or boundary.motion is not None or (len(boundary.pos) and not boundary.shapes):
+    if any(metadata.periodic) or boundary.motion is not None or boundary.vel.any() or nodes_beside_shapes(boundary).any():
         return []
     pos, vel = truth.pos.astype(np.float64), truth.vel[0].astype(np.float64)
     weight = truth.mass.astype(np.float64) / truth.mass.sum(dtype=np.float64)
@@ -62,11 +63,21 @@ def mirrors(truth: Trajectory) -> list[Mirror]:
         same = np.abs(vel - opposite).max() <= CLOSE * fastest and (truth.node_type == truth.node_type[partner]).all()
         same = same and np.allclose(truth.mass, truth.mass[partner], rtol=1e-3)
         same = same and np.allclose(truth.material_params, truth.material_params[partner], rtol=1e-3, equal_nan=True)
-        near = [np.minimum(signed_distance(boundary.shapes, x), metadata.connectivity_radius) for x in (pos, mirror.image(pos))]
         with_partners = Mirror(axis, mirror.offset, partner)
-        if same and np.abs(near[0] - near[1]).max() <= close and _has_mirrored_loads(truth, with_partners):
+        if same and _has_mirrored_surroundings(truth, pos, with_partners) and _has_mirrored_loads(truth, with_partners):
             found.append(with_partners)
     return found
+
+
+def _has_mirrored_surroundings(truth: Trajectory, pos: np.ndarray, mirror: Mirror) -> bool:
+    """Tell whether the nodes of all frames are as far from the surfaces of each friction and restitution as their mirror images, within the radius."""
+    shapes, most = truth.boundary.shapes, truth.metadata.connectivity_radius
+    for kind in {(shape.friction, shape.restitution) for shape in shapes}:
+        alike = tuple(shape for shape in shapes if (shape.friction, shape.restitution) == kind)
+        near, there = (np.minimum(signed_distance(alike, x), most) for x in (pos, mirror.image(pos)))
+        if np.abs(near - there).max() > CLOSE * truth.metadata.spacing:
+            return False
+    return True
 
 
 def _has_mirrored_loads(truth: Trajectory, mirror: Mirror) -> bool:

@@ -245,6 +245,8 @@ def _whole(stress: np.ndarray) -> np.ndarray:
 
 def _relative(error: np.ndarray, reference: np.ndarray) -> float:
     size, scale = float(np.linalg.norm(error)), float(np.linalg.norm(reference))
+    if not math.isfinite(size):  # a stress that is no number
+        return math.inf
     return size / scale if scale > 0 else (0.0 if size == 0 else math.inf)
 
 

@@ -83,7 +83,8 @@ class Guard:
         low, high = self._box
         pos, vel = (np.ascontiguousarray(as_numpy(x), np.float64) for x in (state.pos, state.vel))
         within: bool = _within(pos, vel, low, high, self.max_speed**2, self.spacing, self.max_crowding)
-        return within and (state.frame_velocity is None or bool(np.isfinite(as_numpy(state.frame_velocity)).all()))
+        others = [x for x in (state.frame_velocity, state.stress.node if state.stress is not None else None) if x is not None]
+        return within and all(bool(np.isfinite(as_numpy(x)).all()) for x in others)
 
     @cached_property
     def _box(self) -> tuple[np.ndarray, np.ndarray]:
@@ -96,10 +97,12 @@ class Guard:
         finite = xp.all(xp.isfinite(state.pos) & xp.isfinite(state.vel), axis=-1)
         if state.frame_velocity is not None:
             finite = finite & xp.all(xp.isfinite(state.frame_velocity), axis=-1)
+        if state.stress is not None:
+            finite = finite & xp.all(xp.isfinite(state.stress.node), axis=-1)
         if bool(xp.all(finite)):
             return None
         node = int(xp.argmax(xp.astype(~finite, xp.int8)))
-        return _stopped("nan", frame, state, node, "has a position or velocity that is not finite")
+        return _stopped("nan", frame, state, node, "has a position, velocity or stress that is not finite")
 
     def _escape(self, state: State, frame: int) -> Termination | None:
         xp = array_namespace(state.pos)

@@ -274,13 +274,18 @@ def _unit(normal: np.ndarray) -> np.ndarray:
 
 
 def has_nodes_beside_shapes(boundary: Boundary) -> bool:
-    """Return whether a boundary has shapes, but a node is farther from the surfaces of all of them than half the usual distance of nodes."""
+    """Return whether a boundary has shapes, and nodes that belong to none of them."""
+    return bool(boundary.shapes) and bool(nodes_beside_shapes(boundary).any())
+
+
+def nodes_beside_shapes(boundary: Boundary) -> np.ndarray:
+    """Return a mask [boundary_node] of nodes that are farther from the surfaces of all shapes than half the usual distance of nodes."""
     if not boundary.shapes or not len(boundary.pos):
-        return False
+        return np.ones(len(boundary.pos), bool)
     pos = as_numpy(boundary.pos).astype(np.float64)
     distance = np.min([np.abs(shape.signed_distance(pos)) for shape in boundary.shapes], axis=0)
     apart = float(np.median(nearest_distances(pos)))
-    return bool(distance.max() > max(0.5 * apart, 1e-3 * float(np.ptp(pos, axis=0).max())))
+    return np.asarray(distance > max(0.5 * apart, 1e-3 * float(np.ptp(pos, axis=0).max())))
 
 
 def check_steps(boundary: Boundary, frame_dt: float, periodicity: Periodicity) -> None:

@@ -83,6 +83,12 @@ def test_peak_stress_and_stress_in_the_first_contact() -> None:
     cell = np.zeros((FRAMES, len(truth.cells), 4), np.float32)  # type: ignore[arg-type]
     stressed = replace(truth, stress=Stress(stress, cell))
     assert not {r.metric for r in rollout_metrics(truth, stressed, ("full",))} & {*STRESS}  # a model without a stress has not failed
+    broken = wrong.copy()
+    broken[-1, 0, 0] = np.nan
+    assert metrics(replace(truth, stress=Stress(broken, cell)), stressed)["peak_von_mises"] == np.inf
+    broken[touching, 0, 0] = np.nan
+    records = rollout_metrics(replace(truth, stress=Stress(broken, cell)), stressed, ("full",))
+    assert all(r.value == np.inf for r in records if r.metric in {*STRESS, "stress_error", "von_mises_error"})
     found = metrics(replace(truth, stress=Stress(wrong, cell)), stressed)
     assert found["peak_von_mises"] == pytest.approx(3e3) and found["peak_von_mises_ratio"] == pytest.approx(1.5)
     assert found["contact_von_mises_error"] == pytest.approx(0.5)

@@ -79,6 +79,15 @@ def test_gaps_are_distances_to_shapes_or_to_boundary_nodes() -> None:
     assert np.isinf(boundary_gaps(replace(trajectory, boundary=Boundary.empty(2)), bodies)).all()
 
 
+def test_gaps_end_at_nodes_beside_shapes_too() -> None:
+    trajectory = falling()
+    pos = trajectory.pos[0, :1] - [0.0, 0.05]
+    own = trajectory.boundary
+    table = Boundary.from_numpy(np.concatenate([own.pos, pos]), np.concatenate([own.normal, [[0.0, 1.0]]]), friction=0.3, shapes=own.shapes)
+    gaps = boundary_gaps(replace(trajectory, boundary=table), [np.array([0])])
+    np.testing.assert_allclose(gaps[0], 0.05, atol=1e-6)
+
+
 def test_gaps_follow_a_moving_boundary() -> None:
     """A piston that falls as fast as the body keeps its distance."""
     nodes = np.stack([np.linspace(0.3, 0.6, 4), np.full(4, 0.4)], axis=-1)

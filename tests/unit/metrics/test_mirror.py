@@ -97,9 +97,29 @@ def nodes_only(t: Trajectory) -> Trajectory:
     return replace(t, boundary=replace(t.boundary, shapes=()))
 
 
-@pytest.mark.parametrize("change", [spun, displaced, heavier, with_box, tilted_gravity, periodic, nodes_only])
+def rougher_on_the_right(t: Trajectory) -> Trajectory:
+    """The floor is two boxes that meet below the middle of the beam."""
+    boxes = (Box((0.0, 0.0), (0.4, 0.2), 0.3), Box((0.4, 0.0), (1.0, 0.2), 0.8))
+    return replace(t, boundary=Boundary.sample((*t.boundary.shapes, *boxes), 0.05, 2))
+
+
+def nodes_beside_shapes(t: Trajectory) -> Trajectory:
+    own = t.boundary
+    pos, normal = np.concatenate([own.pos, [[0.5, 0.3]]]), np.concatenate([own.normal, [[0.0, 1.0]]])
+    return replace(t, boundary=Boundary.from_numpy(pos, normal, friction=0.3, shapes=own.shapes))
+
+
+@pytest.mark.parametrize(
+    "change", [spun, displaced, heavier, with_box, tilted_gravity, periodic, nodes_only, rougher_on_the_right, nodes_beside_shapes]
+)
 def test_scenes_without_symmetry(change: Callable[[Trajectory], Trajectory]) -> None:
     assert mirrors(change(beam())) == []
+
+
+def test_floors_of_equal_friction_on_both_sides_are_symmetric() -> None:
+    boxes = (Box((0.0, 0.0), (0.4, 0.2), 0.3), Box((0.4, 0.0), (1.0, 0.2), 0.3))
+    t = beam()
+    assert [m.axis for m in mirrors(replace(t, boundary=Boundary.sample((*t.boundary.shapes, *boxes), 0.05, 2)))] == [0]
 
 
 def test_the_mirror_error_of_a_beam_that_drifts_and_tilts() -> None:

@@ -18,7 +18,7 @@ from gpe_pl.rollout.ensemble import Ensemble
 from gpe_pl.rollout.guard import Guard, _depth_through
 from gpe_pl.rollout.loop import Replay, SimulationError, Simulator, Start, fraction_outside, frames, rollout, rollouts
 from gpe_pl.trajectory import integrators
-from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Termination, Trajectory
 
 New = Callable[..., Trajectory]
@@ -137,10 +137,17 @@ def test_no_steps(trajectory: Trajectory) -> None:
     np.testing.assert_array_equal(result.pos, trajectory.pos[2:3])
 
 
+def no_stress(state: State) -> State:
+    node = np.zeros((12, 4))
+    node[7, 2] = np.nan
+    return replace(state, stress=Stress(node, np.zeros((0, 4))))
+
+
 @pytest.mark.parametrize(
     ("reason", "spoil", "message"),
     [
-        ("nan", spoiled("pos", 3, np.nan), "frame 4: node 3 has a position or velocity that is not finite"),
+        ("nan", spoiled("pos", 3, np.nan), "frame 4: node 3 has a position, velocity or stress that is not finite"),
+        ("nan", no_stress, "frame 4: node 7 has a position, velocity or stress that is not finite"),
         ("nan", spoiled("vel", 0, -np.inf), "frame 4: node 0 "),
         ("escape", spoiled("pos", 5, -0.3), "frame 4: node 5 is 0.3 m outside"),
         ("escape", spoiled("pos", 6, 1.5), "frame 4: node 6 is 0.5 m outside"),
@@ -148,7 +155,8 @@ def test_no_steps(trajectory: Trajectory) -> None:
     ],
 )
 def test_guard_keeps_the_good_frames(trajectory: Trajectory, reason: str, spoil: Callable[[State], State], message: str) -> None:
-    start = replace(trajectory.state(0), vel=np.zeros((12, 2)))
+    stress = Stress(np.zeros((12, 4)), np.zeros((0, 4)))
+    start = replace(trajectory.state(0), vel=np.zeros((12, 2)), stress=stress)
     guard = Guard(max_speed=50.0, bounds=trajectory.metadata.bounds, margin=0.1)
     sound = rollout(FreeFall(0.01), start, 8, trajectory.metadata, guard)
     assert sound.termination is None
