@@ -97,7 +97,8 @@ class Coverage:
         replace_text(folder / TABLE, "\n".join([*self._lines(horizons), ""]))
         curves = {group: _curves(own) for group, own in self.groups().items()}
         last = max(curve.inside.shape[1] for curve in curves.values()) - 1
-        save_figure(coverage_figure(curves, LEVELS, LEVEL, self.bands.frame_dt, {**horizons, last: FULL}), folder / FIGURE, dpi=150)
+        ends = {last: FULL if len({len(scene.error) for scene in self.scenes}) == 1 else f"{last * self.bands.frame_dt:.6g}s"}
+        save_figure(coverage_figure(curves, LEVELS, LEVEL, self.bands.frame_dt, {**horizons, **ends}), folder / FIGURE, dpi=150)
 
     def _lines(self, horizons: dict[int, str]) -> list[str]:
         header = [
@@ -113,16 +114,16 @@ class Coverage:
         lines = [table_row(header), "|" + "---|" * len(header)]
         level, per_cent = LEVELS.index(LEVEL), f"{100 * LEVEL:g} %"
         for group, own in self.groups().items():
-            last = min(len(scene.error) for scene in own) - 1
-            for frame, label in {**horizons, last: FULL}.items():
-                if frame > last:
+            for frame, label in [*horizons.items(), (-1, FULL)]:
+                reached = [scene for scene in own if frame < len(scene.error)]
+                if not reached or {len(scene.error) for scene in own} == {frame + 1}:  # the last frame of all is ``full``
                     continue
-                inside = bootstrap_interval([[float(s.inside["nodes"][level, frame]) for s in own]], statistic=np.mean)
-                enough = np.mean([s.enough(level)[frame] for s in own])
-                low, high = chance_range(self.bands.num_scenes, len(own), LEVEL)
-                radii = [f"{np.mean([s.radius[g][frame] for s in own]):.3g}" for g in GUARANTEES]
+                inside = bootstrap_interval([[float(s.inside["nodes"][level, frame]) for s in reached]], statistic=np.mean)
+                enough = np.mean([s.enough(level)[frame] for s in reached])
+                low, high = chance_range(self.bands.num_scenes, len(reached), LEVEL)
+                radii = [f"{np.mean([s.radius[g][frame] for s in reached]):.3g}" for g in GUARANTEES]
                 cells = [
-                    *(group, str(len(own)), label),
+                    *(group, str(len(reached)), label),
                     f"{100 * inside.estimate:.1f} % [{100 * inside.low:.1f}, {100 * inside.high:.1f}]",
                     *(f"{100 * enough:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %", *radii),
                 ]
@@ -130,7 +131,7 @@ class Coverage:
         note = (
             f"Error bands with a level of {per_cent} from {self.bands.num_scenes} scenes of {self.bands.dataset}, {self.bands.split}. Nodes inside: mean "
             f"over scenes of the fraction of nodes inside the narrower bands, with its 95 % bootstrap interval. Enough: at least {per_cent} of a scene's nodes "
-            "inside the wider bands. Nodes whose motion is given do not count. "
+            "inside the wider bands. Nodes whose motion is given do not count. Rows have the scenes that reach their horizon; `full` has each at its end. "
             "By chance: where this number lies in 90 % of draws if bands are exact. Radii are means over nodes."
         )
         return [*lines, "", note]

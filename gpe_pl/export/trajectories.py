@@ -61,8 +61,9 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     """Write a series for ParaView: ``path`` (``.pvd``), and a folder of the same name with a file per frame and the boundary.
 
     Points have ``velocity`` [m/s], ``material`` (index into ``schema.NODE_TYPES``), ``mass`` [kg] and the material parameters by name. If available, they also
-    have ``displacement`` from rest [m], ``error`` (distance from the ground truth [m]), ``stress`` [Pa] and ``von_mises`` [Pa]. Cells have the last two as
-    well, NaN on particles. Moving boundary nodes are points like others; ``boundary.vtu`` has the rest, with ``normal``, ``friction`` and ``restitution``.
+    have ``displacement`` from rest [m], ``error`` (distance from the ground truth [m], NaN for nodes that it does not have in that frame), ``stress`` [Pa] and
+    ``von_mises`` [Pa]. Cells have the last two as well, NaN on particles. Moving boundary nodes are points like others; ``boundary.vtu`` has the rest, with
+    ``normal``, ``friction`` and ``restitution``.
 
     In an open scene, each file has the nodes that are in the scene in its frame, with their numbers as ``node``.
 
@@ -194,6 +195,8 @@ def _point_data(trajectory: Trajectory, frame: int, ground_truth: Trajectory | N
     }
     if ground_truth is not None:
         data["error"] = np.linalg.norm(displacement(trajectory.pos[frame], ground_truth.pos[frame], trajectory.metadata), axis=-1)
+        if ground_truth.alive is not None:
+            data["error"] = np.where(ground_truth.alive[frame], data["error"], np.nan)
     if trajectory.stress is not None:
         data |= _stress(trajectory.stress.node[frame])
     return data

@@ -32,6 +32,7 @@ from gpe_pl.reports.finished_runs import (
     rollout_errors,
     run_name,
     shared_table,
+    shared_trajectories,
     splits_of,
     starts_of,
     table_of,
@@ -180,7 +181,10 @@ def summary(rows: pd.DataFrame) -> str:
             values["full"] = values["1"]
         lines.append((key, "".join(f"{values[h]:11.4g}" if h in values else " " * 11 for h in (*horizons, "full"))))
     widths = [max(len(key[column]) for key, _ in lines) for column in range(3)]
-    return "\n".join(" ".join(f"{name:{width}}" for name, width in zip(key, widths, strict=True)) + cells for key, cells in lines)
+    said = scenes_left_out([Run(Path(), {}, rows)], [*horizons, "full"])
+    return "\n".join(
+        [*(" ".join(f"{name:{width}}" for name, width in zip(key, widths, strict=True)) + cells for key, cells in lines), *said]
+    )
 
 
 def _column(axis: str) -> str:
@@ -302,15 +306,12 @@ def _rollout_table(names: list[str], variants: dict[Variant, list[Run]]) -> list
     lines = [table_row(header), "|" + "---|" * len(header)]
     for split in splits:
         for key, runs in variants.items():
-            trivial = {
-                h: min((_mean(v) for b in baselines if (v := values_by_seed(runs[:1], b, split, "rollout_mse", h))), default=float("nan"))
-                for h in horizons
-            }
             cells = []
             for h in horizons:
                 values = rollout_errors(runs, split, h)
+                trivial = [v for b in baselines if (v := values_by_seed(runs[:1], b, split, "rollout_mse", h))]
                 failed = _failed(values_by_seed(runs, LEARNED, split, "rollout_mse", h))
-                cells.append(_interval(values, 1e3) + _factor(trivial[h] / _mean(values)) + failed if values else "–")
+                cells.append(_interval(values, 1e3) + _factor(_times_lower(values, trivial)) + failed if values else "–")
             lines.append(table_row([*(key or (LEARNED,)), split, *cells]))
         for baseline in baselines:
             rows: defaultdict[tuple[str, ...], list[Variant]] = defaultdict(list)  # most sweeps evaluate all variants in the same scenes
@@ -327,7 +328,28 @@ def _rollout_table(names: list[str], variants: dict[Variant, list[Run]]) -> list
     )
     if "test_unseen" in splits:
         note += " `test_unseen` holds material parameters that training did not have, between the trained ones and outside their range."
-    return [*lines, "", note]
+    other_scenes = [f"{', '.join(key) or LEARNED}: {said}" for key, runs in variants.items() for said in scenes_left_out(runs, horizons)]
+    return [*lines, "", note, *(line for said in other_scenes for line in ("", f"**{said}**"))]
+
+
+def scenes_left_out(runs: list[Run], horizons: Iterable[str]) -> list[str]:
+    """Say which columns of a table are means over fewer scenes than others, because trajectories are shorter or seeds have evaluated other scenes.
+
+    Args:
+        runs: runs that differ in their seeds only.
+        horizons: horizons of the columns.
+    """
+    said = []
+    for split in sorted({split for run in runs for split in splits_of(run) if "/" not in split}):
+        found = {h: values_by_seed(runs, LEARNED, split, "rollout_mse", h) for h in horizons}
+        scenes = {k for values in found.values() for seed in values for k in seed}
+        counts = {h: len(shared_trajectories(values)) for h, values in found.items() if values}
+        fewer = [f"{count} at {h}" for h, count in counts.items() if count < len(scenes)]
+        if fewer:
+            said.append(
+                f"of {len(scenes)} scenes of `{split}`, columns have only {', '.join(fewer)}, so columns with other scenes cannot be compared"
+            )
+    return said
 
 
 def _different_starts(variants: dict[Variant, list[Run]]) -> list[str]:
@@ -380,13 +402,17 @@ def _metric_table(names: list[str], variants: dict[Variant, list[Run]], headings
 
 
 def _factor(ratio: float) -> str:
-    if ratio == 0:  # failed rollouts make the mean infinite
+    if ratio == 0 or np.isnan(ratio):  # failed rollouts make the mean infinite, or no trivial model was evaluated
         return ""
     return f" **{ratio:.1f}×**" if ratio > 1 else f" {ratio:.2g}×" if ratio >= 0.01 else " < 0.01×"
 
 
-def _mean(values: Values) -> float:
-    return float(np.mean([v for seed in values for v in seed.values()])) if values else float("nan")
+def _times_lower(values: Values, trivial: list[Values]) -> float:
+    """Return the smallest ratio of the mean of a trivial model to that of a model, in the scenes that both have."""
+    shared = [(other, scenes) for other in trivial if (scenes := shared_trajectories(values, other))]
+    return min(
+        (float(shared_table(other, scenes).mean() / shared_table(values, scenes).mean()) for other, scenes in shared), default=float("nan")
+    )
 
 
 def _failed(values: Values) -> str:
@@ -397,4 +423,4 @@ def _failed(values: Values) -> str:
 
 
 def _percent(values: Values) -> str:
-    return f"{100 * _mean(values):.3f} %" if values else "–"
+    return f"{100 * float(shared_table(values).mean()):.3f} %" if values else "–"

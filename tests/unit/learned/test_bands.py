@@ -83,6 +83,22 @@ def test_new_scenes_are_covered_as_promised(checkpoint: Path) -> None:
     assert set(values["enough_in_bands"]) == {0.0, 1.0}
 
 
+def test_rows_of_the_table_have_the_scenes_that_reach_them(checkpoint: Path, tmp_path: Path) -> None:
+    coverage = Coverage(of_frames(calibrated(19, checkpoint)))
+    rows = []
+    for number, frames in enumerate((FRAMES, FRAMES, FRAMES - 2)):
+        rows += coverage.add(scene(number, frames), {2: "0.02s", FRAMES - 2: "later"}, ("test", number, "seen", 0.0))
+    coverage.write(tmp_path, {2: "0.02s", FRAMES - 2: "later"})
+    table = [
+        [cell.strip() for cell in line.split("|")]
+        for line in (tmp_path / "coverage.md").read_text().splitlines()
+        if "0.02s" in line or "| later" in line or "| full" in line
+    ]
+    assert [(row[2], row[3]) for row in table] == [("3", "0.02s"), ("2", "later"), ("3", "full")]
+    ends = [row.value for row in rows if (row.metric, row.horizon) == ("fraction_in_bands", "full")]
+    assert table[-1][4].startswith(f"{100 * np.mean(ends):.1f} %")
+
+
 def test_bands_for_scenes_are_wider(checkpoint: Path) -> None:
     own = calibrated(30, checkpoint)
     prediction = scene(99).predictions[LEARNED]

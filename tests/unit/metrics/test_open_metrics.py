@@ -144,6 +144,17 @@ def test_vtk_has_the_nodes_that_are_there(channel: Trajectory, tmp_path: Path) -
         assert 'Name="node"' in text
 
 
+def test_nodes_that_the_ground_truth_does_not_have_have_no_error(channel: Trajectory, tmp_path: Path) -> None:
+    meshio = pytest.importorskip("meshio")
+    assert channel.alive is not None
+    lost = int(np.flatnonzero(channel.alive[40])[0])
+    alive = channel.alive.copy()
+    alive[40:, lost] = False
+    write_vtk(tmp_path / "channel.pvd", channel, replace(channel, alive=alive))
+    found = meshio.read(tmp_path / "channel" / "frame_00040.vtu").point_data
+    assert np.flatnonzero(np.isnan(found["error"])).tolist() == np.flatnonzero(found["node"] == lost).tolist()
+
+
 def test_vtk_has_the_stress_of_particles_at_points_only(channel: Trajectory, tmp_path: Path) -> None:
     frames, nodes = channel.pos.shape[:2]
     write_vtk(tmp_path / "channel.pvd", replace(channel, stress=Stress(np.ones((frames, nodes, 4)), np.ones((frames, 0, 4)))))

@@ -14,7 +14,7 @@ from gpe_pl.evaluation.metric_rows import LEARNED, MetricsError, Row, read_rows,
 from gpe_pl.files import sealed
 from gpe_pl.files.run_folder import RunError
 from gpe_pl.reports import sweep_table
-from gpe_pl.reports.finished_runs import finished_runs
+from gpe_pl.reports.finished_runs import finished_runs, table_of
 
 ERRORS = {  # of two test scenes; free flight has 2e-3 and 6e-3
     ("negated", 0): [1e-3, 3e-3],
@@ -66,6 +66,33 @@ def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path)
     assert cells(runs, "odd")[1][2] == "8 0.5×"
     assert cells(runs, "odd_even")[1][2] == "4e+09 < 0.01×"
     assert cells(runs, "ballistic")[0][2] == "4"
+
+
+@pytest.mark.slow
+def test_seeds_of_other_scenes_are_compared_in_those_that_all_have(runs: Path) -> None:
+    path = runs / "negated" / "1" / "metrics.csv"
+    write_rows(path, [row for row in read_rows(path) if row.trajectory == 0])
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    assert cells(runs, "negated")[1][1:] == ["test_unseen", "1.5 **1.3×**"]
+    note = "**negated: of 2 scenes of `test_unseen`, columns have only 1 at full, so columns with other scenes cannot be compared**"
+    assert note in (runs / "table.md").read_text().splitlines()
+
+
+@pytest.mark.slow
+def test_without_trivial_models_there_is_no_factor(tmp_path: Path) -> None:
+    write_run(tmp_path / "odd", "odd", 0)
+    rows = [row for row in read_rows(tmp_path / "odd" / "metrics.csv") if row.model == LEARNED]
+    write_rows(tmp_path / "odd" / "metrics.csv", rows)
+    sweep_table.report_sweep(tmp_path, finished_runs(tmp_path))
+    assert "×**" not in (tmp_path / "table.md").read_text() and "0.01×" not in (tmp_path / "table.md").read_text()
+
+
+def test_columns_that_some_trajectories_do_not_reach_are_told(runs: Path) -> None:
+    rows = [*read_rows(runs / "odd" / "0" / "metrics.csv")]
+    earlier = [replace(row, horizon="0.1s", value=row.value / 4) for row in rows if row.trajectory == 0]
+    said = sweep_table.summary(table_of([*rows, *earlier])).splitlines()[-1]
+    assert said == "of 2 scenes of `test_unseen`, columns have only 1 at 0.1s, so columns with other scenes cannot be compared"
+    assert "cannot be compared" not in sweep_table.summary(table_of(rows))
 
 
 @pytest.mark.slow
