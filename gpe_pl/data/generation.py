@@ -1,7 +1,8 @@
 """Parallel, resumable generation of data sets.
 
 Every trajectory depends only on its specification (see ``ground_truth``), and every shard is written atomically. A killed run therefore resumes where it
-stopped, and its files equal those of an uninterrupted run. A shard that can be opened counts as complete; ``discard_damaged`` checks every byte. Layout::
+stopped, and its files equal those of an uninterrupted run. A shard that can be opened and is of its data set, split and number counts as complete;
+``discard_damaged`` checks every byte. Layout::
 
     {root}/{name}/{size}/dataset.json            the spec and its checksum, written first
     {root}/{name}/{size}/{split}/shard-00000.h5
@@ -28,7 +29,7 @@ import numpy as np
 
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.chosen_scenes import SPEC_FILE, scene_numbers
-from gpe_pl.data.ground_truth import DatasetSpec, GenerationError, generate_trajectory, initial_state
+from gpe_pl.data.ground_truth import DatasetSpec, GenerationError, generate_trajectory, initial_state, trajectory_metadata
 from gpe_pl.data.position_rounding import ROUNDING_FRACTION, motion_of, rounding_fault, rounding_of
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.files import sealed
@@ -39,13 +40,15 @@ from gpe_pl.solvers.caution import unresolved
 from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
 from gpe_pl.system.workers import pool, results
-from gpe_pl.trajectory.store import StoreError, read_trajectory, trajectory_names, write_shard
+from gpe_pl.trajectory.store import StoreError, read_metadata, read_trajectory, trajectory_names, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
 CONTACT_SHEET_FILE = "contact_sheet.png"
 SHEET_ROWS = 5
+OF_ONE_SCENE = ("dataset", "split", "seed", "parameter_group", "config")
+"""Metadata by which a shard is that of a data set, split and number."""
 
 SCENES_LOOKED_AT = 8
 """Number of training scenes whose meshes are checked for thin parts. Bodies of one data set differ, so one scene is not enough."""
@@ -75,11 +78,15 @@ def _shards(spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> list[tuple[str
 
 
 def _is_complete(spec: DatasetSpec, folder: Path, split: str, shard: int) -> bool:
-    """Whether a shard exists and is readable. It is then complete, because it is written atomically."""
+    """Whether a shard exists, is readable, and is that of this data set, split and number. It is then complete, because it is written atomically."""
+    path, indices = shard_path(folder, split, shard), _shard_indices(spec, split, shard)
     try:
-        return trajectory_names(shard_path(folder, split, shard)) == [f"{i:05d}" for i in _shard_indices(spec, split, shard)]
+        if trajectory_names(path) != [f"{i:05d}" for i in indices]:
+            return False
+        own, wanted = read_metadata(path, f"{indices[0]:05d}"), trajectory_metadata(spec, split, indices[0])
     except StoreError:
         return False
+    return all(getattr(own, key) == getattr(wanted, key) for key in OF_ONE_SCENE)
 
 
 def _fault(path: Path) -> tuple[Path, str]:

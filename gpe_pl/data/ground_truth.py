@@ -180,11 +180,18 @@ class DatasetSpec:
         for key in sorted(scene.keys() & solver.keys()):
             if scene[key] != solver[key]:
                 raise ValueError(f"scene.{key} = {scene[key]} and solver.{key} = {solver[key]} must be equal")
+        for material, own in (scene["density"] if isinstance(scene.get("density"), dict) else {}).items():
+            computed = (solver.get(material) or {}).get("density", own)
+            if computed != own:
+                raise ValueError(f"scene.density.{material} = {own} and solver.{material}.density = {computed} must be equal")
         if set(self.parameters) != set(self.scene.materials):
             raise ValueError(
                 f"parameters are for {', '.join(self.parameters)}, the scene has {', '.join(self.scene.materials)}; "
                 "leave out others with ~data.parameters.MATERIAL"
             )
+        object.__setattr__(
+            self, "parameters", {material: self.parameters[material] for material in self.scene.materials}
+        )  # their order decides draws
         for material, design in self.parameters.items():
             self._check(material, design)
         for key, path in self.scene.input_files.items():

@@ -17,6 +17,8 @@ DATA_CHECKSUMS = "data_sha256"
 """Configuration key with the checksums of the splits that a run used, because data of the same name may be replaced."""
 HYDRA = ".hydra"
 """Subfolder of a run folder that Hydra writes. Hydra follows links in it."""
+LOGS = "log"
+"""Subfolder of a run folder with the logs of a training."""
 LOOKUPS = ("comparison", "larger")
 """Lookup tables of ``data`` and ``size`` from which other configuration keys take their values."""
 
@@ -31,7 +33,7 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
     Args:
         run_dir: folder of the run; created if it is missing.
         config: configuration of the run.
-        results: file patterns. A folder without any such file is free, whatever its configuration.
+        results: file patterns. A folder without any such file is free, whatever its configuration. Logs of another configuration are then removed.
 
     Raises:
         RunError: the folder has results, but its configuration is another one (the message names up to three differing keys), missing or damaged; or the
@@ -48,7 +50,17 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
                 f"{run_dir} holds a run with another configuration ({'; '.join(different[:3])}); choose another name=… or delete the folder"
             )
         return
+    if not _has(path, config):
+        shutil.rmtree(run_dir / LOGS, ignore_errors=True)  # tables would have the curve of the earlier run
     sealed.write(path, config)
+
+
+def _has(path: Path, config: dict[str, Any]) -> bool:
+    """Tell whether a file has a configuration."""
+    try:
+        return not any(differences(config_in(path), config))
+    except (RunError, OSError):
+        return False
 
 
 def refuse_links(run_dir: Path) -> None:

@@ -76,6 +76,15 @@ class Stage(nn.Module):
         return h
 
 
+def _at_targets(new: Tensor, old: Tensor, index: Tensor) -> Tensor:
+    """Return the new effects of nodes into which an edge leads, and the old ones of others.
+
+    Roots of small bodies have no parent at levels that only other bodies have, so these bodies do not change them.
+    """
+    has_edge = torch.zeros(old.shape[0], dtype=torch.bool, device=old.device).index_fill(0, index[1], True)
+    return torch.where(has_edge[:, None], new, old)
+
+
 class DPINet(Model):
     """Model of Li et al. 2019; see the module's docstring for equations and differences.
 
@@ -125,7 +134,8 @@ class DPINet(Model):
         h = features.new_zeros(features.shape[0], self.hidden_channels)
         for name, forward, backward, receivers, num_steps in self._plan(x, params, edges):
             index, edge_features = self.graph.edges(x, edges, forward, backward)
-            h = cast(Stage, self.stages[name])(features, h, index, edge_features, receivers, num_steps)
+            new = cast(Stage, self.stages[name])(features, h, index, edge_features, receivers, num_steps)
+            h = _at_targets(new, h, index) if name == "down" else new
         sizes = [x[m].shape[0] for m in params]
         return dict(zip(params, self.predictor(h[: sum(sizes)]).split(sizes), strict=True))
 

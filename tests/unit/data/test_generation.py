@@ -121,7 +121,7 @@ def test_damage_in_place_is_found_and_repaired(folder, tmp_path, caplog):
     array, text = again / "train" / "shard-00001.h5", again / "val" / "shard-00000.h5"
     with h5py.File(array) as file:
         place = file["00002/pos"].id.get_chunk_info(0).byte_offset
-    for path, where in ((array, place + 40), (text, text.read_bytes().index(b'"frame_dt": ') + 15)):
+    for path, where in ((array, place + 40), (text, text.read_bytes().rindex(b'"frame_dt": ') + 15)):
         damaged = bytearray(path.read_bytes())
         damaged[where] ^= 1
         path.write_bytes(damaged)

@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 
 from gpe_pl.config.datasets import dataset
-from gpe_pl.data.ground_truth import GenerationError, ParameterValues, ValueGroups, generate_trajectory, group_of
+from gpe_pl.config.entry_point import ConfigError
+from gpe_pl.data.ground_truth import GenerationError, ParameterValues, ValueGroups, generate_trajectory, group_of, parameter_values
 
 SPEC = dataset("data=sand", "size=tiny")
 
@@ -37,6 +38,21 @@ def test_a_trajectory_has_the_group_of_the_values_that_it_was_given(split: str, 
     spec = replace(SPEC, parameters={"sand": ParameterValues((20.0, 30.0, 40.0), (25.0,), (15.0,))})
     metadata = generate_trajectory(spec, split, 0, values={"sand": angle}, num_frames=3).metadata
     assert (metadata.split, metadata.parameter_group) == (split, group)
+
+
+def test_the_density_of_a_scene_is_that_of_the_solver() -> None:
+    """The solver takes the volume of a particle from its mass at its own density."""
+    with pytest.raises(ConfigError, match=r"scene.density.elastomer = 4000.0 and solver.elastomer.density = 1000.0 must be equal"):
+        dataset("data=elastomer", "size=tiny", "data.scene.density.elastomer=4000")
+    both = dataset("data=elastomer", "size=tiny", "data.scene.density.elastomer=4000", "data.solver.elastomer.density=4000")
+    assert both.scene.density["elastomer"] == 4000  # type: ignore[attr-defined]
+
+
+def test_the_order_in_which_materials_are_named_changes_nothing() -> None:
+    spec = dataset("data=mixed", "size=tiny")
+    turned = replace(spec, parameters=dict(reversed(spec.parameters.items())))
+    for index in range(4):
+        assert parameter_values(turned, "train", index) == parameter_values(spec, "train", index)
 
 
 def test_the_group_of_several_parameters_is_that_of_the_one_farthest_from_training() -> None:

@@ -1,9 +1,10 @@
-"""What keeps a sound shard from being read does not get it deleted."""
+"""What keeps a sound shard from being read does not get it deleted; a shard of another place is made again."""
 
 from __future__ import annotations
 
 import errno
 import fcntl
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -33,3 +34,12 @@ def test_shards_that_the_machine_cannot_read_now_are_kept(tmp_path: Path, monkey
                 use(tmp_path, SPEC)
         monkeypatch.setattr(h5py, "File", opened)
     assert contents(again) == before
+
+
+@pytest.mark.slow
+def test_a_shard_that_was_copied_from_another_split_is_made_again(tmp_path: Path) -> None:
+    folder = generate(tmp_path, SPEC)
+    before = contents(folder)
+    shutil.copy(folder / "val" / "shard-00000.h5", folder / "test" / "shard-00000.h5")
+    generate(tmp_path, SPEC)
+    assert contents(folder) == before

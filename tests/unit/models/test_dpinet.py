@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
-from torch_geometric.data import HeteroData
+from torch_geometric.data import Batch, HeteroData
 
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, RADIUS, SAME, FeatureSpec, grid
@@ -132,6 +132,21 @@ def test_leaves_reach_as_far_as_they_step(num_steps: int) -> None:
     torch.manual_seed(0)
     model = DPINet(meshes.spec(0), num_steps, hidden_channels=32).double()
     assert influence(model, 0) == [k <= num_steps for k in range(meshes.NUM_NODES)]
+
+
+def test_a_scene_of_fewer_levels_is_computed_as_alone() -> None:
+    """Its roots have no parent at the levels that only another scene of the batch has."""
+    torch.manual_seed(0)
+    model = DPINet(meshes.spec(3), hidden_channels=8).double()
+    tall, low = meshes.graph(3), meshes.graph(3, seed=1)
+    top = grid(3)
+    low[top].x = low[top].x[:0]
+    low[top, DOWN, grid(2)].edge_index = torch.empty(2, 0, dtype=torch.int64)
+    for name in ("odd", "even"):
+        low[top, DOWN, grid(2)][name] = low[top, DOWN, grid(2)][name][:0]
+    together = model(Batch.from_data_list([tall, low])).acceleration["solid"]
+    alone = torch.cat([model(data).acceleration["solid"] for data in (tall, low)])
+    torch.testing.assert_close(together, alone, rtol=1e-12, atol=1e-12)
 
 
 def test_hierarchy_couples_the_whole_body() -> None:

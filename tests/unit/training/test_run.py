@@ -42,6 +42,15 @@ def test_batches_of_another_kind_make_another_run(tmp_path: Path, there: dict[st
         claim(folder, {**now, "evaluation": {"splits": ["test"]}})
 
 
+@pytest.mark.parametrize(("now", "is_kept"), [(CONFIG, True), (BY_NODES, False)])
+def test_logs_of_an_earlier_run_are_not_those_of_the_next(tmp_path: Path, now: dict[str, Any], is_kept: bool) -> None:
+    """Somebody deleted its checkpoints, so that the folder is free."""
+    claim(tmp_path, CONFIG)
+    (tmp_path / "log" / "version_0").mkdir(parents=True)
+    claim(tmp_path, now)
+    assert (tmp_path / "log").exists() == is_kept
+
+
 @pytest.mark.parametrize("config", [CONFIG, BY_NODES])
 def test_the_same_configuration_is_the_same_run(tmp_path: Path, config: dict[str, Any]) -> None:
     folder = finished(tmp_path / "there", config)
