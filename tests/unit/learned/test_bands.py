@@ -85,7 +85,7 @@ def test_new_scenes_are_covered_as_promised(checkpoint: Path) -> None:
 
 def test_rows_of_the_table_have_the_scenes_that_reach_them(checkpoint: Path, tmp_path: Path) -> None:
     coverage = Coverage(of_frames(calibrated(19, checkpoint)))
-    rows = []
+    rows: list[Row] = []
     for number, frames in enumerate((FRAMES, FRAMES, FRAMES - 2)):
         rows += coverage.add(scene(number, frames), {2: "0.02s", FRAMES - 2: "later"}, ("test", number, "seen", 0.0))
     coverage.write(tmp_path, {2: "0.02s", FRAMES - 2: "later"})
