@@ -39,12 +39,12 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         stride_of,
     )
     from gpe_pl.data.checksum import split_checksum
-    from gpe_pl.evaluation.rollouts import evaluate
+    from gpe_pl.evaluation.rollouts import as_evaluated, evaluate
     from gpe_pl.evaluation.settings import EvaluationSettings
     from gpe_pl.evaluation.uncertainty import Uncertainty
     from gpe_pl.files.names import run_name
     from gpe_pl.files.run_folder import claim, release, without_orphans
-    from gpe_pl.learned.ensemble import LearnedEnsemble
+    from gpe_pl.learned.ensemble import LearnedEnsemble, members_of
     from gpe_pl.learned.verdicts import headline
     from gpe_pl.reports.sweep_table import conclusion, report_evaluation
     from gpe_pl.rollout.skips import Skips
@@ -70,7 +70,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     if not simulator.fits(scene):
         stride = simulator.stride_on(scene_metadata(evaluated, cfg.split, strided=False))
         simulator.check_scene(scene, f"data.stride={stride}" if stride else _own_data(simulator))
-    shown = None if cfg.data.get("showcase") is None else _showcase(cfg, simulator)
+    shown = None if cfg.data.get("showcase") is None else _showcase(cfg, members_of(as_evaluated(simulator, settings))[0])
     folder = Path(cfg.paths.runs) / run_name(cfg.name)
     with locked(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
         root = ensure_split(evaluated, cfg.split)
@@ -80,7 +80,12 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
                 start_frame = settings.first_frame(simulator.builder.config.history, scene.frame_dt)
                 controls = material_controls(cfg, settings, root, start_frame, simulator)
                 uncertainty = Uncertainty(
-                    checkpoints, simulator.on(scene), settings, cfg.split, split_checksum(root, cfg.split), cfg.calibrate
+                    checkpoints,
+                    [member.on(scene) for member in ensemble.members],
+                    settings,
+                    cfg.split,
+                    split_checksum(root, cfg.split),
+                    cfg.calibrate,
                 )
                 evaluated_model = ensemble if len(checkpoints) > 1 else simulator
                 stride, bars = stride_of(evaluated), progress_bar if cfg.trainer.progress else no_bar

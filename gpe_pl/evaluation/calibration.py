@@ -11,7 +11,7 @@ import numpy as np
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.evaluation.predictions import PredictedScene
-from gpe_pl.learned.bands import LEVEL, Bands, factors_of, rounded_up, scores_of
+from gpe_pl.learned.bands import LEVEL, Bands, factors_of, identity, rounded_up, scores_of
 from gpe_pl.learned.pretrained import checkpoint_path
 from gpe_pl.learned.unlike import united
 from gpe_pl.learned.verdicts import checksum
@@ -40,12 +40,14 @@ class Calibration:
     scenes: list[np.ndarray] = field(default_factory=list)
     spreads: list[np.ndarray] = field(default_factory=list)
     features: list[dict[str, tuple[float, float]]] = field(default_factory=list)
-    about: tuple[str, str, float] = ("", "", 0.0)
+    identities: list[str] = field(default_factory=list)
+    about: tuple[str, str, float, float] = ("", "", 0.0, 0.0)
 
     def add(self, scene: PredictedScene) -> None:
         """Add a scene after its rollout."""
         prediction, metadata = scene.predictions[LEARNED], scene.truth.metadata
-        self.about = metadata.dataset, metadata.split, metadata.frame_dt
+        self.about = metadata.dataset, metadata.split, metadata.frame_dt, metadata.spacing
+        self.identities.append(identity(scene.truth))
         self.scenes.append(scores_of(prediction, scene.truth, scene.spread))
         self.features.append(scene.features)
         if scene.spread is not None:
@@ -61,7 +63,7 @@ class Calibration:
             raise CalibrationError(
                 f"{len(self.scenes)} calibration scenes: bands with a level of {LEVEL:g} need at least {fewest}; choose more, such as data.num_test=40"
             )
-        dataset, split, frame_dt = self.about
+        dataset, split, frame_dt, spacing = self.about
         shortest = min(map(len, self.spreads), default=0)
         return Bands(
             checkpoints=[checksum(checkpoint_path(path)) for path in checkpoints],
@@ -71,6 +73,8 @@ class Calibration:
             num_scenes=len(self.scenes),
             start_frame=self.start_frame,
             frame_dt=frame_dt,
+            spacing=spacing,
+            scenes=self.identities,
             containment=self.containment,
             settings=self.settings,
             nodes=factors_of(self.scenes, "nodes"),

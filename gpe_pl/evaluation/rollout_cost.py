@@ -17,6 +17,8 @@ from gpe_pl.trajectory.state import State
 
 COST_FILE = "rollout_cost.json"
 """File with the cost of rollouts in the folder of a run or evaluation."""
+WARM_UP = 20
+"""Number of steps before the mean begins."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class Timed:
 
     Attributes:
         simulator: simulator that makes the steps.
-        seconds: processor time per scene of each step so far [s].
+        seconds: processor time of each step of each scene so far [s].
     """
 
     simulator: Simulator
@@ -40,22 +42,24 @@ class Timed:
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
         begun = time.process_time()
         new = step_all(self.simulator, states)
-        self.seconds.append((time.process_time() - begun) / max(1, len(states)))
+        count = max(1, len(states))
+        self.seconds.extend([(time.process_time() - begun) / count] * count)
         return new
 
 
 def write_cost(folder: Path, seconds: list[float], frame_dt: float) -> None:
-    """Write the median processor time of a step of one scene [s], and this time divided by ``frame_dt``. Without a step, nothing is written.
+    """Write the mean processor time of a step of one scene [s], and this time divided by ``frame_dt``. Without a step, nothing is written.
 
-    The first steps take longer because functions are compiled; they hardly change the median.
+    The mean counts steps that skip their work, and those that do not, as often as they happen. The first steps, in which functions are compiled, are left out
+    if there are enough others.
 
     Args:
         folder: folder of the run or evaluation.
-        seconds: processor time per scene of each step [s].
+        seconds: processor time of each step of each scene [s], in their order.
         frame_dt: time between frames [s].
     """
     if seconds:
-        step = float(np.median(seconds))
+        step = float(np.mean(seconds[min(WARM_UP, len(seconds) // 2) :]))
         sealed.write(folder / COST_FILE, {"seconds_per_step": step, "seconds_per_simulated_second": step / frame_dt})
 
 

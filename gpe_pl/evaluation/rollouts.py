@@ -95,7 +95,7 @@ def evaluate(
     first = members_of(simulator)[0]
     frame_dt = first.builder.metadata.frame_dt
     start_frame = settings.first_frame(first.builder.config.history, frame_dt)
-    simulator = _as_evaluated(simulator, settings)
+    simulator = as_evaluated(simulator, settings)
     check_formats(settings, simulator)
     run_dir.mkdir(parents=True, exist_ok=True)
     if MODELS & {*settings.export}:  # before the rollouts, which would be lost with a model that cannot be written
@@ -133,7 +133,7 @@ def _scene_in(root: Path, split: str, stride: int) -> Metadata:
     return open_split(root, split, cache_bytes=0)[0].window(0, 1).metadata.every(stride)
 
 
-def _as_evaluated(simulator: LearnedSimulator | LearnedEnsemble, settings: EvaluationSettings) -> LearnedSimulator | LearnedEnsemble:
+def as_evaluated(simulator: LearnedSimulator | LearnedEnsemble, settings: EvaluationSettings) -> LearnedSimulator | LearnedEnsemble:
     """Return the simulator with the settings of an evaluation."""
     return configured(
         simulator,

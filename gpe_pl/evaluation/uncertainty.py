@@ -26,7 +26,7 @@ class Uncertainty:
 
     Args:
         checkpoints: checkpoints of the evaluated model, or of the members of an ensemble.
-        first: the model, or the first member, for the spacing and the frames of the split (``LearnedSimulator.on``).
+        members: the model, or the members, for the spacing and the frames of the split (``LearnedSimulator.on``).
         settings: settings of the evaluation.
         split: evaluated split.
         split_checksum: checksum of its scenes.
@@ -39,20 +39,21 @@ class Uncertainty:
     def __init__(
         self,
         checkpoints: Sequence[str],
-        first: LearnedSimulator,
+        members: Sequence[LearnedSimulator],
         settings: EvaluationSettings,
         split: Split,
         split_checksum: str,
         calibrate: bool = False,
     ) -> None:
         self.checkpoints, self.split = checkpoints, split
-        frame_dt = first.builder.metadata.frame_dt
+        first, self.num_repeated = members[0], 0
+        frame_dt, spacing = first.builder.metadata.frame_dt, first.builder.metadata.spacing
         self.horizons = labels(settings.horizons, frame_dt)
         start_frame = settings.first_frame(first.builder.config.history, frame_dt)
-        other = _other_settings(settings, first)
+        other = _other_settings(settings, members)
         self.calibration = Calibration(split_checksum, settings.containment, start_frame, other) if calibrate else None
         stored = None if calibrate else bands.read(*checkpoints)
-        unfit = "" if stored is None else stored.unfit(start_frame, frame_dt, settings.containment, other, split_checksum)
+        unfit = "" if stored is None else stored.unfit(start_frame, frame_dt, spacing, settings.containment, other, split_checksum)
         if unfit:
             log.warning("the coverage of the model's error bands is not measured: %s", unfit)
         self.coverage = None if stored is None or unfit else Coverage(stored)
@@ -73,8 +74,12 @@ class Uncertainty:
             return
         spread = None if scene.spread is None else scene.spread.mean(axis=1)
         num_unlike = self.unlike.add(scene.features, spread)
-        if self.coverage is not None:
-            yield Row(LEARNED, *about, "num_unlike", "full", float(num_unlike))
+        if self.coverage is None:
+            return
+        yield Row(LEARNED, *about, "num_unlike", "full", float(num_unlike))
+        if bands.identity(scene.truth) in self.coverage.bands.scenes:
+            self.num_repeated += 1
+        else:
             yield from self.coverage.add(scene, self.horizons, about)
 
     def finish(self, folder: Path) -> None:
@@ -95,18 +100,22 @@ class Uncertainty:
             print(path)
             return
         self.unlike.warn(self.split)
-        if self.coverage is not None:
+        if self.num_repeated:
+            log.warning(
+                "the coverage of the model's error bands leaves out %d scenes of %s that calibrated them", self.num_repeated, self.split
+            )
+        if self.coverage is not None and self.coverage.scenes:
             self.coverage.write(folder, self.horizons)
             print((folder / TABLE).read_text(encoding="utf-8"))
 
 
-def _other_settings(settings: EvaluationSettings, simulator: LearnedSimulator) -> dict[str, bool | int | float]:
-    """Return the settings, besides start and containment, with which rollouts differ from those of the model by default, by key."""
+def _other_settings(settings: EvaluationSettings, members: Sequence[LearnedSimulator]) -> dict[str, bool | int | float]:
+    """Return the settings, besides start and containment, with which rollouts differ from those of the model, or of any member, by default, by key."""
     own = {
-        "clamp_parameters": simulator.clamps_parameters,
-        "static_friction": simulator.static_friction,
-        "mirror_average": simulator.mirror_average,
+        "clamp_parameters": {member.clamps_parameters for member in members},
+        "static_friction": {member.static_friction for member in members},
+        "mirror_average": {member.mirror_average for member in members},
     }
     given = {name: getattr(settings, name) for name in own}
-    changed = {f"evaluation.{name}": value for name, value in given.items() if value is not None and value != own[name]}
-    return {**changed, **{f"rollout.{name}": value for name, value in simulator.skips.approximations.items()}}
+    changed = {f"evaluation.{name}": value for name, value in given.items() if value is not None and own[name] != {value}}
+    return {**changed, **{f"rollout.{name}": value for name, value in members[0].skips.approximations.items()}}

@@ -10,6 +10,7 @@ import numpy as np
 from gpe_pl.export.play_model import PageError
 from gpe_pl.export.program import refuse_loads, refuse_openings, refuse_rigid_bodies
 from gpe_pl.geometry.shapes import Shape
+from gpe_pl.solvers.supported import boundary_conflict
 from gpe_pl.trajectory.boundary import Boundary, as_numpy
 from gpe_pl.trajectory.state import State
 
@@ -29,11 +30,13 @@ def shape_for_page(shape: Shape) -> dict[str, Any]:
 
 
 def check_boundary(boundary: Boundary) -> None:
-    """Raise ``PageError`` for walls and obstacles that move, or that have points only."""
+    """Raise ``PageError`` for walls and obstacles that move, or whose points are not those of their shapes."""
     if boundary.motion is not None or bool((as_numpy(boundary.vel) != 0).any()):
         raise PageError("pages have walls and obstacles that stand still; leave out scenes in which they move")
     if len(boundary.pos) and not boundary.shapes:
         raise PageError("pages compute walls and obstacles from their shapes; leave out scenes whose boundary has points only")
+    if (conflict := boundary_conflict(boundary)) is not None:
+        raise PageError(f"pages compute walls and obstacles from their shapes, and {conflict}")
 
 
 def state_for_page(state: State, columns: list[int]) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.boundary import search_tree
 from gpe_pl.trajectory.cells import cell_edges
 from gpe_pl.trajectory.loads import Loads
+from gpe_pl.trajectory.rigid_bodies import bodies_of
 from gpe_pl.trajectory.state import State, Stress
 
 
@@ -109,7 +110,7 @@ class Sleeping(Batched):
         if state.loads is not None:
             is_calm &= ~_are_loaded(state.loads)
         cells = np.empty((0, 2), np.int64) if state.cells is None else state.cells.cpu().numpy()
-        edges, space = cell_edges(cells, len(pos)), state.periodicity
+        edges, space = np.concatenate([cell_edges(cells, len(pos)), _rigid_edges(state)], axis=1), state.periodicity
         islands = islands_within(self.radius, pos, walls_of(state, self.radius), edges, space)
         awake = _in_the_same_island(~is_calm, islands.label)
         seen = awake.copy()
@@ -118,7 +119,7 @@ class Sleeping(Batched):
             others = space.from_corner(pos[~awake]) if space else pos[~awake]
             distance, _ = search_tree(pos[awake], space).query(others, distance_upper_bound=reach)
             seen[~awake] = np.isfinite(distance)
-            if len(cells):  # the graph of a mesh needs all of it
+            if len(cells) or state.rigid_body is not None:  # the graph of a mesh needs all of it, and so does the motion of a rigid body
                 seen = _in_the_same_island(seen, islands.label)
         return torch.from_numpy(awake).to(state.pos.device), torch.from_numpy(seen).to(state.pos.device)
 
@@ -141,7 +142,7 @@ class Sleeping(Batched):
             at_frame = torch.zeros_like(state.vel)
             at_frame[awake] = after.frame_velocity[moved]
             before, now = before if state.frame_velocity is None else state.frame_velocity, at_frame
-        skips, unit = self.simulator.skips, self.simulator.builder.scales.velocity
+        skips, unit = self.simulator.skips, self.simulator.builder.metadata.spacing / self.dt
         is_slow = now.norm(dim=1) < skips.rest_step_spacings * unit
         calm = is_slow & ((now - before).norm(dim=1) < skips.rest_step_change_spacings * unit)
         count = torch.where(awake, torch.where(calm, _rest_of(state) + 1, 0), _rest_of(state))
@@ -162,6 +163,13 @@ def _are_loaded(loads: Loads) -> np.ndarray:
     moves = np.zeros(len(loads.prescribed), dtype=bool)
     moves[loads.rows] = (loads.next_positions() != loads.path[0]).any(axis=1)
     return moves if loads.force is None else moves | (loads.force[0] != 0).any(axis=1)
+
+
+def _rigid_edges(state: State) -> np.ndarray:
+    """Return pairs of nodes [2, edge] that make each rigid body one island, also where its parts are farther apart than the radius."""
+    bodies = [] if state.rigid_body is None else bodies_of(state.rigid_body.cpu())
+    pairs = [np.stack([rows[:-1], rows[1:]]) for rows in map(np.asarray, bodies)]
+    return np.concatenate([np.empty((2, 0), np.int64), *pairs], axis=1)
 
 
 def _rest_of(state: State) -> Tensor:

@@ -67,7 +67,7 @@ def roll_out_with_bands(
         guard: stops the rollout at the first state that it rejects.
 
     Raises:
-        ValueError: bands of this level are not stored, or are of another number of members or of frames of another length.
+        ValueError: bands of this level are not stored, or are of another number of members, of frames of another length or of another spacing.
         SceneError: the scene does not fit the model.
     """
     members = members_of(simulator.on(metadata))
@@ -77,7 +77,7 @@ def roll_out_with_bands(
         )
     dt, spreads = metadata.frame_dt, [np.zeros(state.num_nodes)]
     if bands is not None:
-        _check_fit(bands, dt, members[0], state.time)
+        _check_fit(bands, metadata, members[0], state.time)
     watch = Watch(members[0], num_steps)
     watch.see(0, state)
 
@@ -102,8 +102,15 @@ def roll_out_with_bands(
     return BandedRollout(trajectory, radius, own_spread, [line for line, _ in unlike.lines.values()])
 
 
-def _check_fit(bands: Bands, frame_dt: float, simulator: LearnedSimulator, start: float) -> None:
-    """Raise ``ValueError`` if bands are of frames of another length. Warn if they are of other approximate levels or of rollouts from another time [s]."""
+def _check_fit(bands: Bands, metadata: Metadata, simulator: LearnedSimulator, start: float) -> None:
+    """Raise ``ValueError`` if bands are of frames of another length or of another spacing. Warn if they are of other approximate levels or of rollouts from
+    another time [s].
+    """
+    frame_dt = metadata.frame_dt
+    if bands.spacing is not None and not math.isclose(bands.spacing, metadata.spacing, rel_tol=1e-3):
+        raise ValueError(
+            f"the bands are of nodes {bands.spacing:g} m apart, those of the scene are {metadata.spacing:g} m apart; calibrate with such nodes"
+        )
     if not math.isclose(bands.frame_dt, frame_dt, rel_tol=1e-6):
         raise ValueError(
             f"the bands are of frames of {bands.frame_dt:g} s, those of the scene have {frame_dt:g} s; calibrate with such frames"

@@ -68,6 +68,8 @@ class Bands:
         frame_dt: time between frames [s].
         containment: whether rollouts are contained in walls.
         settings: other settings with which rollouts differ from those of the model by default, by key.
+        spacing: rest spacing of nodes [m]; None in earlier files.
+        scenes: identities of the calibration scenes (see ``identity``); empty in earlier files.
         nodes, scene: factors of frames 1, 2, … by level; None where there are too few scenes, or too many rollouts failed.
         spread: largest mean spread of an ensemble over the nodes of a calibration scene, in frames 1, 2, … [m]; empty for a single model.
         features: lowest and highest values of features in calibration scenes, by name (see ``unlike``).
@@ -86,6 +88,8 @@ class Bands:
     spread: list[float]
     features: dict[str, tuple[float, float]]
     settings: dict[str, bool | int | float] = field(default_factory=dict)
+    spacing: float | None = None
+    scenes: list[str] = field(default_factory=list)
 
     @property
     def num_frames(self) -> int:
@@ -130,13 +134,21 @@ class Bands:
         return np.where(prediction.is_predicted, factors[:, None] * scale_of(prediction, spread), 0.0)
 
     def unfit(
-        self, start_frame: int, frame_dt: float, containment: bool, settings: Mapping[str, bool | int | float], split_checksum: str
+        self,
+        start_frame: int,
+        frame_dt: float,
+        spacing: float,
+        containment: bool,
+        settings: Mapping[str, bool | int | float],
+        split_checksum: str,
     ) -> str:
         """Return why the bands promise nothing for rollouts of a split, in words for a message; an empty text if they do."""
         if split_checksum == self.split_checksum:
             return "these scenes are the calibration scenes"
         if not math.isclose(frame_dt, self.frame_dt, rel_tol=1e-6):
             return f"frames are {frame_dt:g} s long, in calibration {self.frame_dt:g} s"
+        if self.spacing is not None and not math.isclose(spacing, self.spacing, rel_tol=1e-3):
+            return f"nodes are {spacing:g} m apart, in calibration {self.spacing:g} m"
         for key in {**self.settings, **settings}:
             own, known = (values.get(key, "the default") for values in (settings, self.settings))
             if own != known:
@@ -146,6 +158,12 @@ class Bands:
         if containment != self.containment:
             return f"evaluation.containment={str(containment).lower()}, in calibration {str(self.containment).lower()}"
         return ""
+
+
+def identity(truth: Trajectory) -> str:
+    """Return a digest of the first frame of a scene and of its material parameters, by which a scene is known again in another split or data set."""
+    values = (truth.pos[0], truth.vel[0], truth.material_params)
+    return sha256(b"".join(np.ascontiguousarray(own).tobytes() for own in values)).hexdigest()[:16]
 
 
 def scale_of(prediction: Trajectory, spread: Float[np.ndarray, "frame node"] | None) -> Float[np.ndarray, "frame node"]:

@@ -176,6 +176,7 @@ class LearnedSimulator(nn.Module):
             return self
         other = copy.copy(self)
         other.builder = self.builder.at(scene.spacing, scene.frame_dt)
+        other._averaged = MirrorAverage(other.builder.metadata.bounds, other.builder.metadata.frame_dt)
         other.least_distance = self.least_distance * scene.spacing / self.builder.metadata.spacing
         return other
 

@@ -19,12 +19,12 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics import Metric
 
 from gpe_pl.metrics import bodies, liquids, open_scenes
 from gpe_pl.metrics.bodies import Bodies, body_metrics
+from gpe_pl.metrics.energy_distance import distance_of_materials
 from gpe_pl.metrics.liquids import liquid_metrics, liquid_nodes
 from gpe_pl.metrics.mirror import mirror_error, mirrors
 from gpe_pl.rollout.loop import fraction_outside
@@ -158,50 +158,6 @@ def _reached(horizons: Sequence[Horizon], error: Float[np.ndarray, "frame"], gro
         steps = _num_steps(horizon, ground_truth)
         if 1 <= steps < len(error):
             yield horizon, steps
-
-
-# --- distribution -------------------------------------------------------------------------------------------------------------------------
-
-
-def energy_distance(
-    a: Float[np.ndarray, "node_a dim"],
-    b: Float[np.ndarray, "node_b dim"],
-    mass_a: Float[np.ndarray, "node_a"],
-    mass_b: Float[np.ndarray, "node_b"],
-) -> float:
-    """Return the energy distance [m] between two clouds of particles, ``2 E|A - B| - E|A - A'| - E|B - B'|``.
-
-    A and A' are the positions ``a`` [m] of particles drawn with probabilities in proportion to the masses ``mass_a`` [kg]; B and B' likewise.
-
-    The distance compares distributions of material, not single particles. It therefore stays meaningful after chaotic motion has made errors of single
-    particles meaningless. It is zero only for equal distributions. The value is exact; unlike a Sinkhorn divergence, it needs no smoothing length and no
-    stopping rule. It takes O(N²) time and O(N) memory.
-
-    Source: Székely and Rizzo, Energy statistics, J. Stat. Plan. Inference 143 (2013).
-    """
-    between = _mean_distance(a, b, mass_a, mass_b)
-    # Rounding can give a tiny negative number.
-    return max(0.0, 2 * between - _mean_distance(a, a, mass_a, mass_a) - _mean_distance(b, b, mass_b, mass_b))
-
-
-def _mean_distance(a: np.ndarray, b: np.ndarray, mass_a: np.ndarray, mass_b: np.ndarray) -> float:
-    a, b = a.astype(np.float64), b.astype(np.float64)
-    weight_a, weight_b = mass_a.astype(np.float64) / mass_a.sum(dtype=np.float64), mass_b.astype(np.float64) / mass_b.sum(dtype=np.float64)
-    rows = max(1, 2**22 // len(b))  # blocks of at most 32 MB
-    return float(sum(weight_a[k : k + rows] @ (cdist(a[k : k + rows], b) @ weight_b) for k in range(0, len(a), rows)))
-
-
-def _cloud_distance(prediction: Trajectory, ground_truth: Trajectory, frame: int) -> float:
-    """Return the energy distance [m], computed for each material and averaged by mass. Two materials that swap places are then an error."""
-    mass, types = ground_truth.mass.astype(np.float64), ground_truth.node_type
-    total = 0.0
-    for code in np.unique(types):
-        own = (types == code) & ground_truth.is_predicted
-        if not own.any():
-            continue
-        distance = energy_distance(prediction.pos[frame, own], ground_truth.pos[frame, own], mass[own], mass[own])
-        total += distance * float(mass[own].sum())
-    return total / float(mass[ground_truth.is_predicted].sum())
 
 
 def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: int) -> dict[str, float]:
@@ -386,7 +342,9 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
             if "rigid_deformation" in values:
                 values["rigid_deformation"] = rigid_deformation(prediction, steps)
             if not periodic:
-                values["energy_distance"] = _cloud_distance(prediction, ground_truth, steps)
+                values["energy_distance"] = distance_of_materials(
+                    prediction, ground_truth, steps, ground_truth.is_predicted, ground_truth.is_predicted
+                )
             if own_bodies is not None and true_bodies is not None:
                 values |= body_metrics(own_bodies, true_bodies, steps)
         records += [Record(name, horizon, value) for name, value in values.items()]
@@ -404,12 +362,9 @@ def _open_records(prediction: Trajectory, ground_truth: Trajectory, horizons: Se
         if np.isfinite(error[: steps + 1]).all():
             values["rollout_mse"], values["final_mse"] = float(error[1 : steps + 1].mean()), float(error[steps])
             values |= open_scenes.open_metrics(prediction, ground_truth, steps)
-            there = [open_scenes.present(t)[steps] for t in (prediction, ground_truth)]
-            if "energy_distance" in values and not any(mask.any() for mask in there):
-                values["energy_distance"] = 0.0
-            elif "energy_distance" in values and all(mask.any() for mask in there):
-                clouds = [(t.pos[steps, mask], t.mass[mask]) for t, mask in zip((prediction, ground_truth), there, strict=True)]
-                values["energy_distance"] = energy_distance(clouds[0][0], clouds[1][0], clouds[0][1], clouds[1][1])
+            if "energy_distance" in values:
+                there = [open_scenes.present(t)[steps] for t in (prediction, ground_truth)]
+                values["energy_distance"] = distance_of_materials(prediction, ground_truth, steps, *there)
             if "fraction_outside" in values:
                 values["fraction_outside"] = fraction_outside(
                     prediction.frames(1, steps + 1), tolerance=1e-3 * ground_truth.metadata.spacing

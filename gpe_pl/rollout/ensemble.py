@@ -15,6 +15,7 @@ from array_api_compat import array_namespace
 
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
 from gpe_pl.trajectory.boundary import Array
+from gpe_pl.trajectory.rigid_bodies import moved_rigidly
 from gpe_pl.trajectory.state import State, Stress
 
 
@@ -52,7 +53,7 @@ class Ensemble:
             )
         before = [self._states_of(state) for state in states]
         columns = [step_all(member, [own[k] for own in before]) for k, member in enumerate(self.members)]
-        return [self._combined(items) for items in zip(*columns, strict=True)]
+        return [self._combined(state, items) for state, items in zip(states, zip(*columns, strict=True), strict=True)]
 
     def _states_of(self, state: State) -> tuple[State, ...]:
         if not isinstance(state.internal, _Members):
@@ -66,13 +67,25 @@ class Ensemble:
             )
         return state.internal.states
 
-    def _combined(self, items: tuple[State | SimulationError, ...]) -> State | SimulationError:
+    def _combined(self, before: State, items: tuple[State | SimulationError, ...]) -> State | SimulationError:
         for k, item in enumerate(items):
             if isinstance(item, SimulationError):
                 return SimulationError(f"member {k + 1} of {len(items)}: {item}", reason=item.reason, node=item.node)
         states = tuple(item for item in items if isinstance(item, State))
-        mean = mean_state(states)
+        mean = _rigid(before, mean_state(states))
         return replace(mean, internal=_Members(states, mean.pos))
+
+
+def _rigid(before: State, mean: State) -> State:
+    """Return a mean state in which each rigid body has the shape of the state before, at the place nearest to the mean of its nodes."""
+    dt = mean.time - before.time
+    if before.rigid_body is None or dt <= 0:
+        return mean
+    way = before.periodicity.shortest(mean.pos - before.pos)
+    is_free = (before.rigid_body < 0)[:, None]
+    rigid = moved_rigidly(before, replace(mean, vel=way / dt), dt)
+    xp = array_namespace(mean.pos)
+    return mean.corrected(rigid.pos, xp.where(is_free, mean.vel, rigid.vel))
 
 
 def mean_state(states: Sequence[State]) -> State:

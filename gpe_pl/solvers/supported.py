@@ -45,11 +45,16 @@ def check_surroundings(state: State, solver: str, computes_open_scenes: bool = F
             "or use Boundary.sample",
             reason="input",
         )
-    if (conflict := _conflict(b)) is not None:
+    if any(shape.restitution != 0 for shape in b.shapes):
+        raise SimulationError(
+            f"{solver} takes walls and obstacles from the shapes of the boundary, and a shape has restitution, which it does not compute",
+            reason="input",
+        )
+    if (conflict := boundary_conflict(b)) is not None:
         raise SimulationError(f"{solver} takes walls and obstacles from the shapes of the boundary, and {conflict}", reason="input")
 
 
-def _conflict(boundary: Boundary) -> str | None:
+def boundary_conflict(boundary: Boundary) -> str | None:
     """Return in which way the nodes of a boundary are not those of its shapes; None if they are. Models read the nodes."""
     if (known := _checked.get(id(boundary))) is not None and known[0] is boundary:
         return known[1]
@@ -64,8 +69,6 @@ def _compared(boundary: Boundary) -> str | None:
     shapes, dim = boundary.shapes, boundary.pos.shape[-1]
     if any(shape_fault(shape, dim) for shape in shapes):
         return None  # solvers name these
-    if any(shape.restitution != 0 for shape in shapes):
-        return "a shape has restitution, which it does not compute"
     if has_nodes_beside_shapes(boundary):
         return "some of its nodes are on none of them; pass a shape for each, or use Boundary.sample"
     pos, friction = np.asarray(boundary.pos, np.float64), np.asarray(boundary.friction, np.float64)

@@ -130,6 +130,15 @@ def test_a_mirror_average_moves_bodies_rigidly() -> None:
     assert np.ptp(predicted.pos[:, :16], axis=0).max() > SPACING
 
 
+def test_a_mirror_average_at_another_frame_interval_moves_bodies_by_their_velocities() -> None:
+    truth = falling()
+    simulator = learned(builder_of(truth, scales="dimensionless")).double().configured(mirror_average=True)
+    slower = truth.every(2)
+    start = simulator.on(slower.metadata).initial_state(slower, 2)
+    after = simulator.on(slower.metadata).step(start)
+    np.testing.assert_allclose((after.pos - start.pos)[:16], after.vel[:16] * slower.metadata.frame_dt, atol=1e-12)
+
+
 def test_exported_programs_and_pages_refuse_rigid_bodies(tmp_path: Path) -> None:
     truth = falling()
     simulator = learned(builder_of(truth))

@@ -184,6 +184,16 @@ def test_pages_refuse_what_they_would_compute_otherwise() -> None:
     points = replace(state, boundary=replace(state.boundary, shapes=()))
     with pytest.raises(PageError, match="boundary has points only"):
         state_for_page(points, [0])
+    walls = state.boundary
+    ledge = replace(
+        walls,
+        **{name: torch.cat([x, x[:1] + (0.2 if name == "pos" else 0.0)]) for name, x in vars(walls).items() if isinstance(x, torch.Tensor)},
+    )
+    with pytest.raises(PageError, match="some of its nodes are on none of them"):
+        state_for_page(replace(state, boundary=ledge), [0])
+    slippery = replace(walls, friction=0.1 * walls.friction)
+    with pytest.raises(PageError, match=r"boundary_node \d+ has the friction .*, the shape there .*; give both the same"):
+        state_for_page(replace(state, boundary=slippery), [0])
     moving = replace(state, boundary=replace(state.boundary, vel=state.boundary.vel + 1.0))
     with pytest.raises(PageError, match="walls and obstacles that stand still"):
         state_for_page(moving, [0])

@@ -168,6 +168,31 @@ def test_what_is_at_rest_sleeps_in_any_unit(length: float, time: float) -> None:
     assert asleep == [0, 0, 20, 20]
 
 
+@pytest.mark.parametrize(("longer", "slower"), [(1.0, 1.0), (0.5, 1.0), (1.0, 2.0), (2.0, 0.5)])
+def test_a_model_of_several_scales_has_the_limits_of_its_scene(longer: float, slower: float) -> None:
+    """The left heap creeps by 0.02 spacings within a frame and sleeps, the right one by 0.05 and does not."""
+    usual = scenes.metadata()
+    whole = silenced(simulator(scenes.builder(("sand",), history=1, scales="dimensionless"), rest_step_spacings=0.03))
+    simulated = whole.at(spacing=longer * usual.spacing, frame_dt=slower * usual.frame_dt)
+    own = simulated.builder.metadata
+    step = np.where(np.arange(40)[:, None] < 20, [0.02, 0.0], [0.05, 0.0]) * own.spacing / own.frame_dt
+    state = two_heaps(gap=1.0)
+    boundary = replace(state.boundary, pos=longer * state.boundary.pos, shapes=())
+    state = replace(state, pos=longer * state.pos, vel=step, velocity_history=step[:, None], boundary=boundary).to_torch()
+    for _ in range(4):
+        state = Sleeping(simulated).step(state)
+    assert state.num_asleep == 20
+
+
+def test_a_rigid_body_of_two_parts_sleeps_as_a_whole() -> None:
+    simulated = simulator(scenes.builder())
+    start = after_rest(sleeping := Sleeping(simulated), two_heaps(gap=1.0).to_torch())
+    assert sleeping.step(start).num_asleep == 20
+    body = torch.full((40,), -1)
+    body[15:25] = 0  # of both heaps
+    assert sleeping.step(replace(start, rigid_body=body)).num_asleep == 0
+
+
 def test_a_rollout_that_is_taken_up_again_is_the_same() -> None:
     simulated = simulator(scenes.builder(), repeat_frames=2, rest_step_spacings=0.05, rest_step_change_spacings=5.0)
     runner, state = approximate(simulated), two_heaps(speed=0.3).to_torch()

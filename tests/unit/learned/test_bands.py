@@ -61,8 +61,8 @@ def calibrated(num_scenes: int, checkpoint: Path, first: int = 0) -> Bands:
 
 
 def of_frames(own: Bands) -> Bands:
-    """Return bands for the frames of ``tests.scenes``."""
-    return replace(own, frame_dt=metadata().frame_dt)
+    """Return bands for the frames and the spacing of ``tests.scenes``."""
+    return replace(own, frame_dt=metadata().frame_dt, spacing=metadata().spacing)
 
 
 def covered(own: Bands, scenes: list[PredictedScene]) -> list[Row]:
@@ -161,15 +161,17 @@ def test_bands_survive_the_file(checkpoint: Path, tmp_path: Path) -> None:
 def test_bands_name_what_they_do_not_hold_for(checkpoint: Path) -> None:
     own = calibrated(19, checkpoint)
     dt = own.frame_dt
-    assert own.unfit(2, dt, True, {}, "other") == ""
-    assert "calibration scenes" in own.unfit(2, dt, True, {}, "abc")
-    assert "frame 3" in own.unfit(3, dt, True, {}, "other") and "containment=false" in own.unfit(2, dt, False, {}, "other")
-    assert f"frames are {2 * dt:g} s long" in own.unfit(2, 2 * dt, True, {}, "other")
+    h = own.spacing
+    assert h is not None and own.unfit(2, dt, h, True, {}, "other") == ""
+    assert "calibration scenes" in own.unfit(2, dt, h, True, {}, "abc")
+    assert "frame 3" in own.unfit(3, dt, h, True, {}, "other") and "containment=false" in own.unfit(2, dt, h, False, {}, "other")
+    assert f"frames are {2 * dt:g} s long" in own.unfit(2, 2 * dt, h, True, {}, "other")
+    assert own.unfit(2, dt, h / 2, True, {}, "other") == f"nodes are {h / 2:g} m apart, in calibration {h:g} m"
     key = "rollout.repeat_frames"
-    assert own.unfit(2, dt, True, {key: 4}, "other") == f"{key} is 4, in calibration the default"
+    assert own.unfit(2, dt, h, True, {key: 4}, "other") == f"{key} is 4, in calibration the default"
     skipped = replace(own, settings={key: 4})
-    assert skipped.unfit(2, dt, True, {}, "other") == f"{key} is the default, in calibration 4"
-    assert skipped.unfit(2, dt, True, {key: 4}, "other") == ""
+    assert skipped.unfit(2, dt, h, True, {}, "other") == f"{key} is the default, in calibration 4"
+    assert skipped.unfit(2, dt, h, True, {key: 4}, "other") == ""
 
 
 def test_older_bands_are_of_rollouts_with_the_settings_of_the_model(checkpoint: Path) -> None:
@@ -262,13 +264,39 @@ def test_bands_of_other_frames_are_refused_and_of_other_levels_marked(checkpoint
 
 def test_the_settings_of_a_rollout_are_those_that_differ_from_the_model(checkpoint: Path) -> None:
     simulator = LearnedSimulator.from_checkpoint(checkpoint)
-    assert _other_settings(EvaluationSettings(), simulator) == {}
-    assert _other_settings(EvaluationSettings(mirror_average=False, static_friction=simulator.static_friction), simulator) == {}
+    assert _other_settings(EvaluationSettings(), [simulator]) == {}
+    assert _other_settings(EvaluationSettings(mirror_average=False, static_friction=simulator.static_friction), [simulator]) == {}
     simulator.skips = Skips(repeat_frames=3)
     given = EvaluationSettings(mirror_average=True, clamp_parameters=False)
-    assert _other_settings(given, simulator) == {
+    assert _other_settings(given, [simulator]) == {
         "evaluation.mirror_average": True, "evaluation.clamp_parameters": False, "rollout.repeat_frames": 3,
     }  # fmt: skip
+
+
+def test_a_setting_that_one_member_has_of_its_own_is_one_that_differs(checkpoint: Path) -> None:
+    first = LearnedSimulator.from_checkpoint(checkpoint)
+    second = first.configured(mirror_average=True)
+    assert _other_settings(EvaluationSettings(mirror_average=False), [first, second]) == {"evaluation.mirror_average": False}
+
+
+def test_scenes_that_calibrated_bands_do_not_count_as_new(checkpoint: Path, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    simulator = LearnedSimulator.from_checkpoint(checkpoint)
+    own = of_frames(calibrated(19, checkpoint))
+    assert len({*own.scenes}) == 19
+    bands.write(
+        bands.path_beside([checkpoint]),
+        replace(
+            own,
+            start_frame=EvaluationSettings().first_frame(simulator.builder.config.history, own.frame_dt),
+            spacing=simulator.builder.metadata.spacing,
+        ),
+    )
+    seen = Uncertainty([str(checkpoint)], [simulator], EvaluationSettings(horizons=[0.02]), "test", "other")
+    rows = [row for seed in (3, 400, 4, 401) for row in seen.see(scene(seed), ("test", seed, "seen", 0.0))]
+    assert {row.trajectory for row in rows if row.metric == "fraction_in_bands"} == {400, 401}
+    seen.finish(tmp_path)
+    assert "leaves out 2 scenes of test that calibrated them" in caplog.text
+    bands.path_beside([checkpoint]).unlink()
 
 
 def test_a_model_at_another_scale_has_the_horizons_of_its_scene(tmp_path: Path) -> None:
@@ -277,14 +305,14 @@ def test_a_model_at_another_scale_has_the_horizons_of_its_scene(tmp_path: Path) 
     simulator.save(tmp_path / "own.ckpt")
     for factor, frame in ((1.0, 20), (2.0, 10)):
         here = simulator.at(frame_dt=factor * metadata().frame_dt)
-        seen = Uncertainty([str(tmp_path / "own.ckpt")], here, EvaluationSettings(horizons=[0.1]), "test", "abc")
+        seen = Uncertainty([str(tmp_path / "own.ckpt")], [here], EvaluationSettings(horizons=[0.1]), "test", "abc")
         assert [*seen.horizons] == [frame]
 
 
 def test_bands_of_a_shipped_model_are_not_replaced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     shipped = bands.path_beside(["sand"])
     before, sand = shipped.read_bytes(), LearnedSimulator.from_checkpoint("sand")
-    found = Uncertainty(["sand"], sand, EvaluationSettings(horizons=[0.1]), "test", "abc", calibrate=True)
+    found = Uncertainty(["sand"], [sand], EvaluationSettings(horizons=[0.1]), "test", "abc", calibrate=True)
     assert found.calibration is not None
     for k in range(9):
         found.calibration.add(scene(k))

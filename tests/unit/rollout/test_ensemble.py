@@ -37,6 +37,34 @@ def test_members_follow_their_own_trajectories(trajectory: Trajectory) -> None:
     assert np.abs(mean.pos - averaged.pos)[2:].max() > 1e-3
 
 
+@dataclass(frozen=True)
+class Turning:
+    """Turns all nodes about the origin by an angle in each frame."""
+
+    angle: float
+
+    def step(self, state: State) -> State:
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        pos = state.pos @ np.array([[c, s], [-s, c]])
+        return state.later(0.01, pos, (pos - state.pos) / 0.01)
+
+
+def test_the_mean_of_rigid_bodies_is_rigid(trajectory: Trajectory) -> None:
+    """It is at the mean place, and turned by the mean angle."""
+    start = trajectory.state(0)
+    body = np.where(np.arange(start.num_nodes) < 8, 0, -1)
+    angles = 0.02, 0.06
+    after = Ensemble((Turning(angles[0]), Turning(angles[1]))).step(replace(start, rigid_body=body))
+    before, now = start.pos[:8] - start.pos[:8].mean(axis=0), after.pos[:8] - after.pos[:8].mean(axis=0)
+    np.testing.assert_allclose(np.linalg.norm(now, axis=1), np.linalg.norm(before, axis=1), rtol=1e-9)
+    turned = np.angle((now[:, 0] + 1j * now[:, 1]) / (before[:, 0] + 1j * before[:, 1]))
+    np.testing.assert_allclose(turned, np.mean(angles), rtol=1e-3)
+    members = [Turning(angle).step(start).pos for angle in angles]
+    np.testing.assert_allclose(after.pos[8:], np.mean(members, axis=0)[8:], atol=1e-12)
+    weight = start.mass[:8] / start.mass[:8].sum()
+    np.testing.assert_allclose(weight @ after.pos[:8], weight @ np.mean(members, axis=0)[:8], atol=1e-9)
+
+
 def test_spread_is_the_distance_from_the_mean(trajectory: Trajectory) -> None:
     start, simulators = trajectory.state(0), [Growing(0.5), Growing(1.5), Growing(1.0)]
     assert spread(start) is None
