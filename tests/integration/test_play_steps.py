@@ -185,10 +185,9 @@ def test_pages_refuse_what_they_would_compute_otherwise() -> None:
     with pytest.raises(PageError, match="boundary has points only"):
         state_for_page(points, [0])
     walls = state.boundary
-    ledge = replace(
-        walls,
-        **{name: torch.cat([x, x[:1] + (0.2 if name == "pos" else 0.0)]) for name, x in vars(walls).items() if isinstance(x, torch.Tensor)},
-    )
+    longer: dict[str, Any] = {name: torch.cat([x, x[:1]]) for name, x in vars(walls).items() if isinstance(x, torch.Tensor)}
+    longer["pos"][-1] += 0.2
+    ledge = replace(walls, **longer)
     with pytest.raises(PageError, match="some of its nodes are on none of them"):
         state_for_page(replace(state, boundary=ledge), [0])
     slippery = replace(walls, friction=0.1 * walls.friction)
