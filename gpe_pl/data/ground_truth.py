@@ -189,9 +189,8 @@ class DatasetSpec:
                 f"parameters are for {', '.join(self.parameters)}, the scene has {', '.join(self.scene.materials)}; "
                 "leave out others with ~data.parameters.MATERIAL"
             )
-        object.__setattr__(
-            self, "parameters", {material: self.parameters[material] for material in self.scene.materials}
-        )  # their order decides draws
+        ordered = {material: self.parameters[material] for material in self.scene.materials}
+        object.__setattr__(self, "parameters", ordered)  # the order decides what is drawn
         for material, design in self.parameters.items():
             self._check(material, design)
         for key, path in self.scene.input_files.items():
