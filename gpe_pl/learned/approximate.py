@@ -13,18 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpe_pl.graphs.islands import islands_within
 from gpe_pl.graphs.neighbors import radius_between
-from gpe_pl.graphs.search import walls_of
 from gpe_pl.graphs.topology import GraphError
+from gpe_pl.learned.mean_velocities import islands_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.flow import FollowsNodes
 from gpe_pl.rollout.loop import SimulationError, Simulator, sound, step_all
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.boundary import search_tree
-from gpe_pl.trajectory.cells import cell_edges
 from gpe_pl.trajectory.loads import Loads
-from gpe_pl.trajectory.rigid_bodies import bodies_of
 from gpe_pl.trajectory.state import State, Stress
 
 
@@ -109,9 +106,7 @@ class Sleeping(Batched):
         is_calm &= ~self._are_near_a_moving_wall(state, pos)
         if state.loads is not None:
             is_calm &= ~_are_loaded(state.loads)
-        cells = np.empty((0, 2), np.int64) if state.cells is None else state.cells.cpu().numpy()
-        edges, space = np.concatenate([cell_edges(cells, len(pos)), _rigid_edges(state)], axis=1), state.periodicity
-        islands = islands_within(self.radius, pos, walls_of(state, self.radius), edges, space)
+        islands, space = islands_of(state, self.radius), state.periodicity
         awake = _in_the_same_island(~is_calm, islands.label)
         seen = awake.copy()
         if awake.any() and not awake.all():
@@ -119,7 +114,9 @@ class Sleeping(Batched):
             others = space.from_corner(pos[~awake]) if space else pos[~awake]
             distance, _ = search_tree(pos[awake], space).query(others, distance_upper_bound=reach)
             seen[~awake] = np.isfinite(distance)
-            if len(cells) or state.rigid_body is not None:  # the graph of a mesh needs all of it, and so does the motion of a rigid body
+            if (
+                state.cells is not None or state.rigid_body is not None
+            ):  # the graph of a mesh needs all of it, and so does the motion of a rigid body
                 seen = _in_the_same_island(seen, islands.label)
         return torch.from_numpy(awake).to(state.pos.device), torch.from_numpy(seen).to(state.pos.device)
 
@@ -163,13 +160,6 @@ def _are_loaded(loads: Loads) -> np.ndarray:
     moves = np.zeros(len(loads.prescribed), dtype=bool)
     moves[loads.rows] = (loads.next_positions() != loads.path[0]).any(axis=1)
     return moves if loads.force is None else moves | (loads.force[0] != 0).any(axis=1)
-
-
-def _rigid_edges(state: State) -> np.ndarray:
-    """Return pairs of nodes [2, edge] that make each rigid body one island, also where its parts are farther apart than the radius."""
-    bodies = [] if state.rigid_body is None else bodies_of(state.rigid_body.cpu())
-    pairs = [np.stack([rows[:-1], rows[1:]]) for rows in map(np.asarray, bodies)]
-    return np.concatenate([np.empty((2, 0), np.int64), *pairs], axis=1)
 
 
 def _rest_of(state: State) -> Tensor:

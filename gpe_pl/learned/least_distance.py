@@ -92,6 +92,7 @@ def kept_apart(state: State, distance: float, dt: float) -> State:
     pos, has_moved = start, False
     for _ in range(NUM_PASSES):
         way = state.periodicity.shortest(pos[i] - pos[j])
+        way[..., 0] = torch.where((way == 0).all(dim=1), 1e-12 * distance, way[..., 0])  # nodes at one place part along the first axis
         length = torch.linalg.vector_norm(way, dim=1).clamp(min=1e-12 * distance)
         gap = distance - length
         if not bool((gap > 0).any()):

@@ -34,6 +34,7 @@ from gpe_pl.learned.checkpoint_file import CheckpointError as CheckpointError
 from gpe_pl.learned.checkpoint_file import load_checkpoint, reason
 from gpe_pl.learned.checkpoint_weights import check_sizes, check_statistics
 from gpe_pl.learned.least_distance import kept_apart
+from gpe_pl.learned.mean_velocities import history_at_start
 from gpe_pl.learned.mirror_average import MirrorAverage
 from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.pretrained import checkpoint_path
@@ -331,15 +332,11 @@ class LearnedSimulator(nn.Module):
         return self._checked(state, f"frame {frame}")
 
     def standing(self, state: State, scene: Metadata) -> State:
-        """Return an initial state for a scene without earlier frames, on this model's device. All velocities of the history equal the present velocity.
-
-        Raises:
-            SceneError: as ``initial_state``.
-        """
+        """Return an initial state for a scene without earlier frames, on this model's device (``mean_velocities``). Errors: those of ``initial_state``."""
         self._check_own(scene)
         state = state.to_torch(self.acceleration_std.device)
-        history = state.vel[:, None].expand(-1, self.builder.config.history, -1)
-        return self._checked(replace(state, velocity_history=history.clone(), frame_velocity=None), "start")
+        history = history_at_start(state, self.builder)
+        return self._checked(replace(state, vel=history[:, -1], velocity_history=history, frame_velocity=None), "start")
 
     def fits(self, scene: Metadata) -> bool:
         """Return whether a scene has the frame interval, spacing (to 1 %), dimension and material parameters of training, and only its materials and loads.

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.trajectory.boundary import nodes_beside_shapes
-from gpe_pl.trajectory.reflection import Reflection
+from gpe_pl.trajectory.reflection import Reflection, without_gravity
 from gpe_pl.trajectory.trajectory import Trajectory
 
 CLOSE = 0.01
@@ -54,7 +54,7 @@ def mirrors(truth: Trajectory) -> list[Mirror]:
     weight = truth.mass.astype(np.float64) / truth.mass.sum(dtype=np.float64)
     close, fastest = CLOSE * metadata.spacing, np.abs(vel).max(initial=0.0)
     found = []
-    for axis in (k for k, pull in enumerate(metadata.gravity) if pull == 0):
+    for axis in without_gravity(metadata.gravity):
         mirror = Mirror(axis, float(weight @ pos[0, :, axis]), np.arange(truth.num_nodes))
         distance, partner = cKDTree(pos[0]).query(mirror.image(pos[0]))
         if not (distance <= close).all() or len(np.unique(partner)) < len(partner):

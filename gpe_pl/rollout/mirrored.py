@@ -14,8 +14,9 @@ from gpe_pl.trajectory.state import State
 class Mirrored:
     """Mirrors a state at a plane, makes the step, and mirrors the result back.
 
-    A rollout equals that of the inner simulator if that simulator is mirror-symmetric. The image of a boundary has no shapes, so the inner simulator has to
-    read boundary nodes, as learned simulators do. Containment goes outside: ``Contained(Mirrored(simulator, …), dt)``.
+    A rollout equals that of the inner simulator if that simulator is mirror-symmetric. The image of a boundary has no shapes if one of them has no image
+    (``geometry.reflected_shapes``). The inner simulator then has to read boundary nodes, as learned simulators do. Containment goes
+    outside: ``Contained(Mirrored(simulator, …), dt)``.
 
     Attributes:
         simulator: simulator that makes the steps.

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from array_api_compat import array_namespace, device
 
+from gpe_pl.geometry.reflected_shapes import reflected
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State, Stress
@@ -18,6 +19,8 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 Array = Any
 
+LEVEL = 1e-9
+"""Gravity along an axis counts as none if it is smaller than this fraction of its length, as rounding makes it."""
 ONE_WAY = 0.05
 """Walls face mostly one way along an axis if the mean of this component of their normals is larger. The mean is 0 over closed surfaces."""
 
@@ -33,8 +36,14 @@ def level_axes(gravity: Sequence[float], normal: Array) -> list[int]:
         normal: unit normals of walls [boundary_node, dim].
     """
     if any(float(pull) != 0 for pull in gravity):
-        return [axis for axis, pull in enumerate(gravity) if float(pull) == 0]
+        return without_gravity(gravity)
     return [axis for axis in range(len(gravity)) if abs(float(normal[:, axis].sum())) <= ONE_WAY * normal.shape[0]]
+
+
+def without_gravity(gravity: Sequence[float]) -> list[int]:
+    """Return the axes along which there is no gravity [m/s²], up to rounding."""
+    size = max(abs(float(pull)) for pull in gravity)
+    return [axis for axis, pull in enumerate(gravity) if abs(float(pull)) <= LEVEL * size]
 
 
 class Isometry(Protocol):
@@ -136,6 +145,12 @@ class Reflection(Isometry):
     def point(self, x: Array) -> Array:
         """Return the images of positions [..., dim] in m."""
         return self.vector(x) + _row([0.0 if plane is None else 2 * plane for plane in self.planes], x)
+
+    def boundary(self, boundary: Boundary) -> Boundary:
+        """Return the image of a boundary. It has shapes if all of its shapes have images (``reflected_shapes``)."""
+        image = super().boundary(boundary)
+        shapes = [reflected(shape, self.planes) for shape in boundary.shapes]
+        return image if None in shapes else replace(image, shapes=tuple(shape for shape in shapes if shape is not None))
 
     def openings(self, openings: tuple[Opening, ...]) -> tuple[Opening, ...]:
         """Return the images of inlets and outlets, with their sides."""

@@ -54,6 +54,15 @@ def test_a_pair_moves_apart_along_its_line_by_masses() -> None:
     torch.testing.assert_close(after.pos, pos + way, rtol=0, atol=1e-12)
 
 
+def test_nodes_at_one_place_move_apart() -> None:
+    state = liquid(num_nodes=2)
+    state = state.corrected(state.pos[:1].repeat(2, 1), state.vel)
+    apart = kept_apart(state, 0.5 * scenes.SPACING, 0.01).pos
+    assert float((apart[0] - apart[1]).norm()) > 0.4 * scenes.SPACING
+    weight = state.mass / state.mass.sum()
+    torch.testing.assert_close(weight @ apart, weight @ state.pos)
+
+
 def test_rigid_bodies_of_a_liquid_keep_their_shape() -> None:
     state = liquid()
     body = torch.where(torch.arange(len(state.pos)) < 12, 0, -1)

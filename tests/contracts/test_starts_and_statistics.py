@@ -7,10 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch_geometric.data import HeteroData
 
+from gpe_pl import Scene, roll_out
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
@@ -160,3 +162,18 @@ def test_what_a_checkpoint_says_is_bounded_before_it_is_looked_at(checkpoint: Pa
     with pytest.raises(CheckpointError, match=message) as caught:
         LearnedSimulator.from_checkpoint(tmp_path / "hostile.ckpt")
     assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize("name", ["sand", "snow", "elastomer"])
+def test_a_start_without_history_flies_as_far_as_free_fall(name: str) -> None:
+    """Mean velocities of the frames before the start lag behind the velocity at its instant, and at rest they do not."""
+    simulator = LearnedSimulator.from_checkpoint(name)
+    scene = Scene(box=(1.0, 1.0)).block(name, at=(0.4, 0.6), size=(0.1, 0.1), velocity=(0.3, 0.5))
+    state, metadata = scene.block(name, at=(0.1, 0.0), size=(0.1, 0.1)).state(simulator)
+    start = simulator.standing(state, metadata)
+    flies = state.pos[:, 1] > 0.5
+    rollout = roll_out(simulator, start, 10, metadata)
+    time = metadata.frame_dt * np.arange(11)[:, None]
+    way = rollout.pos[:, flies].mean(axis=1) - rollout.pos[0, flies].mean(axis=0)
+    np.testing.assert_allclose(way, time * [0.3, 0.5] - 0.5 * time**2 * [0.0, 9.81], atol=1e-6)
+    assert start.velocity_history is not None and (start.velocity_history[~torch.from_numpy(flies)] == 0).all()

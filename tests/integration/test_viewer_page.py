@@ -205,7 +205,7 @@ def test_the_mouse_finds_a_node_in_every_panel_and_turns_a_scene(opened: Any) ->
 @pytest.mark.slow
 def test_the_mouse_says_at_least_where_a_stored_value_is_cut(opened: Any) -> None:
     truth = falling(2)
-    vel = truth.vel + [0.0, -1.0]
+    vel = truth.vel + np.array([0.0, -1.0])
     vel[8, 12] = [0.0, -1e7]
     viewer = opened(replace(truth, vel=vel), GPE=falling(2, noise=0.3))
     stage = viewer.page.locator("#stage").bounding_box()

@@ -115,7 +115,7 @@ def galilean_boost(subject: Subject) -> Outcome:
 def rotations(subject: Subject) -> Outcome:
     dim = subject.simulator.builder.spec.dim
     quarter, mirror = torch.eye(dim, dtype=torch.float64), torch.eye(dim, dtype=torch.float64)
-    quarter[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
+    quarter[-2:, -2:] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])  # the vertical is one of the last two axes, so gravity turns
     mirror[0, 0] = -1.0
     errors: dict[str, list[float]] = {}
     for scene, truth in enumerate(subject.scenes):
