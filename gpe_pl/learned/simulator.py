@@ -334,9 +334,9 @@ class LearnedSimulator(nn.Module):
     def standing(self, state: State, scene: Metadata) -> State:
         """Return an initial state for a scene without earlier frames, on this model's device (``mean_velocities``). Errors: those of ``initial_state``."""
         self._check_own(scene)
-        state = state.to_torch(self.acceleration_std.device)
-        history = history_at_start(state, self.builder)
-        return self._checked(replace(state, vel=history[:, -1], velocity_history=history, frame_velocity=None), "start")
+        state = replace(state.to_torch(self.acceleration_std.device), velocity_history=None, frame_velocity=None)
+        history = history_at_start(self._checked(state, "start"), self.builder)
+        return replace(state, vel=history[:, -1], velocity_history=history)
 
     def fits(self, scene: Metadata) -> bool:
         """Return whether a scene has the frame interval, spacing (to 1 %), dimension and material parameters of training, and only its materials and loads.
