@@ -115,6 +115,11 @@ class BodyLayer(nn.Module):
                 {"weight": torch.zeros(len(FIRST), param_channels), "bias": torch.tensor(FIRST).log() / scale}
             )
 
+    @property
+    def thickness(self) -> float:
+        """Distance of nodes below which bodies push each other, in rest spacings; 0 without a layer."""
+        return min(float(self.log_thickness.detach().exp()), TOUCH_REACH) if self.has_thickness else 0.0
+
     def law_of(
         self, nodes: Int64[Tensor, "pair 2"], params: Float[Tensor, "node param"], modulus: Float[Tensor, " node"], spacing: Tensor
     ) -> Float[Tensor, "pair 5"]:

@@ -10,6 +10,8 @@ A scene gives no spacing, masses, history or limits: they follow from the model.
 
 from __future__ import annotations
 
+import itertools
+import logging
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -41,6 +43,8 @@ from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+
+log = logging.getLogger(__name__)
 
 Point = Sequence[float | int]
 
@@ -324,6 +328,7 @@ class Scene:
             faults[solids[1]] = "contact between solids is not computed; keep one solid in a scene"
         if faults:
             raise SceneFault(faults, self)
+        self._warn_of_pushes(found, simulator)
         metadata = replace(own, dataset="scene", bounds=self.box, gravity=self.gravity, split="", seed=self.seed)
         state = self._joined(found, values, shapes, own)
         return state.opened([opening for _, opening in openings]) if openings else state, metadata
@@ -527,6 +532,18 @@ class Scene:
                 if distance.min() < CLOSEST * spacing:
                     faults[name] = f"overlaps {other}; move one of the two"
             trees[name] = cKDTree(nodes.pos)
+
+    def _warn_of_pushes(self, found: Mapping[str, Nodes], simulator: LearnedSimulator) -> None:
+        """Warn of bodies that the elastic law of the model pushes apart from the start."""
+        spacing, law = simulator.builder.metadata.spacing, getattr(simulator.model, "elastic_bodies", None)
+        layers = {} if law is None else dict(law.body_layer.items())
+        bodies = [body for body in self.filled if body.material in layers]
+        for one, other in itertools.combinations(bodies, 2):
+            gap = float(cKDTree(found[one.name].pos).query(found[other.name].pos)[0].min())
+            reach = layers[one.material].thickness * spacing
+            if one.material == other.material and gap < reach:
+                text = "%s and %s are %.2g m apart; the model pushes bodies apart that are nearer than %.2g m, which the solver does not"
+                log.warning(text, one.name, other.name, gap, reach)
 
     def _joined(
         self, found: Mapping[str, Nodes], values: Mapping[str, dict[str, float]], shapes: Mapping[str, Shape], own: Metadata

@@ -128,6 +128,13 @@ def test_a_model_of_a_periodic_domain_is_refused() -> None:
         Scene(box=(1.0, 1.0)).block("sand", at=(0.1, 0.0), size=(0.2, 0.2)).state(simulator)
 
 
+@pytest.mark.parametrize(("gap", "is_told"), [(0.03, True), (0.2, False)])
+def test_bodies_that_the_model_pushes_apart_from_the_start_are_told(gap: float, is_told: bool, caplog: pytest.LogCaptureFixture) -> None:
+    scene = Scene(box=(1.0, 1.0)).block("elastomer", at=(0.2, 0.1), size=(0.2, 0.2))
+    scene.block("elastomer", at=(0.2, 0.3 + gap), size=(0.2, 0.2)).state(model("elastomer"))
+    assert ("block 1 (elastomer) and block 2 (elastomer) are" in caplog.text) == is_told
+
+
 def test_a_polygon_is_a_body_in_either_direction() -> None:
     corners = [(0.2, 0.2), (0.6, 0.2), (0.4, 0.6)]
     counts = [Scene(box=(1.0, 1.0)).polygon("sand", order).state(model("sand"))[0].num_nodes for order in (corners, corners[::-1])]
