@@ -16,6 +16,7 @@ from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.data.ground_truth import trajectory_metadata
 from gpe_pl.evaluate import evaluate_checkpoint
+from gpe_pl.evaluation import showcase
 from gpe_pl.evaluation.metric_rows import Row, read_rows
 from gpe_pl.export.play_model import PageError
 from gpe_pl.files.run_folder import RunError
@@ -319,13 +320,19 @@ def test_only_the_split_that_is_asked_for_is_generated(tiny_data: Path, tmp_path
 
 
 @pytest.mark.long
-def test_the_canyon_is_compared_with_the_solver_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_canyon_is_compared_with_the_solver_and_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     spec = dataset_spec(compose("simulate", *DATA, "data=fluid"))
     builder = GraphBuilder(GraphConfig(history=2), trajectory_metadata(spec, "train", 0))
     LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder).save(tmp_path / "water.ckpt")
     show = [f"data.showcase.{key}" for key in ("num_steps=2", "scene.num_particles=50", "scene.bounds=[[0,3],[0,1.5],[0,1.5]]")]
     smaller = ["data.sizes.tiny.d3.num_particles=50", "data.showcase.scene.reservoir=null", "evaluation.num_pictures=0", *show]
-    rows = evaluate(tmp_path, tmp_path, tmp_path / "water.ckpt", "data=fluid", "scene=canyon", *smaller)
+    seen, run = list[LearnedSimulator](), showcase.run
+    monkeypatch.setattr(showcase, "run", lambda simulator, *further: seen.append(simulator) or run(simulator, *further))
+    settings = ["evaluation.mirror_average=true", "evaluation.clamp_parameters=false"]
+    rows = evaluate(tmp_path, tmp_path, tmp_path / "water.ckpt", "data=fluid", "scene=canyon", *smaller, *settings)
+    assert [(own.mirror_average, own.clamps_parameters) for own in seen] == [(True, False)]
     assert {r.model for r in rows} == {"learned", "ballistic", "stops_at_walls", "constant_velocity"}
     assert (tmp_path / "evaluation_test_unseen" / "showcase.json").exists()
     printed = capsys.readouterr().out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -114,8 +115,7 @@ def galilean_boost(subject: Subject) -> Outcome:
 @stress_test(6, "rotations by 90° and reflections", "gravity turned too: one-step error ≤ 1.2 times that of the scene as it is")
 def rotations(subject: Subject) -> Outcome:
     dim = subject.simulator.builder.spec.dim
-    quarter, mirror = torch.eye(dim, dtype=torch.float64), torch.eye(dim, dtype=torch.float64)
-    quarter[-2:, -2:] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])  # the vertical is one of the last two axes, so gravity turns
+    quarter, mirror = quarter_turn(subject.simulator.builder.metadata.gravity), torch.eye(dim, dtype=torch.float64)
     mirror[0, 0] = -1.0
     errors: dict[str, list[float]] = {}
     for scene, truth in enumerate(subject.scenes):
@@ -128,6 +128,15 @@ def rotations(subject: Subject) -> Outcome:
     rms = {name: float(np.sqrt(np.mean(values))) for name, values in errors.items()}
     ratios = {name: value / rms["as it is"] for name, value in rms.items() if name != "as it is"}
     return Outcome(largest(ratios.values()) <= 1.2, ", ".join(f"{name}: {ratio:.2f}" for name, ratio in ratios.items()))
+
+
+def quarter_turn(gravity: Sequence[float]) -> Tensor:
+    """Return a rotation by 90° [dim, dim] in a plane with the vertical, so that gravity [m/s²] turns, too."""
+    vertical = int(np.argmax(np.abs(gravity)))
+    first, second = (vertical - 1, vertical) if vertical else (0, 1)
+    quarter = torch.eye(len(gravity), dtype=torch.float64)
+    quarter[[first, first, second, second], [first, second, first, second]] = torch.tensor([0.0, -1.0, 1.0, 0.0], dtype=torch.float64)
+    return quarter
 
 
 def _transformed(state: State, q: Tensor) -> State:

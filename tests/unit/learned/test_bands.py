@@ -250,6 +250,8 @@ def test_bands_of_other_frames_are_refused_and_of_other_levels_marked(checkpoint
     start = replace(single.standing(state().to_torch(), metadata()), time=own.start_frame * metadata().frame_dt)
     with pytest.raises(ValueError, match=r"the bands are of frames of 0.02 s, those of the scene have 0.005 s"):
         roll_out_with_bands(single, start, 3, metadata(), replace(own, frame_dt=0.02))
+    with pytest.raises(ValueError, match=r"the bands are of nodes 0.1 m apart, those of the scene are 0.05 m apart"):
+        roll_out_with_bands(single, start, 3, metadata(), replace(own, spacing=0.1))
     exact = roll_out_with_bands(single, start, 4, metadata(), own)
     assert "promise nothing" not in caplog.text
     roll_out_with_bands(single, replace(start, time=start.time + 25 * metadata().frame_dt), 3, metadata(), own)

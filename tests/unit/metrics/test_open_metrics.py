@@ -65,6 +65,22 @@ def test_errors_count_living_nodes_only(channel: Trajectory) -> None:
     np.testing.assert_allclose(per_frame_mse(moved, channel)[1:], 0.01, rtol=1e-4)
 
 
+def test_materials_that_swap_places_are_a_distance_in_open_scenes(channel: Trajectory) -> None:
+    """The upper layers are of another material, and the prediction has them below."""
+    names = ("friction_angle", "hardening_coefficient")
+    metadata = replace(channel.metadata, materials=("sand", "snow"), param_names=names)
+    snow = channel.pos[20, :, 1] > 0.15
+    types = np.where(snow, node_code("snow"), node_code("sand")).astype(np.uint8)
+    mixed = replace(channel, metadata=metadata, node_type=types, material_params=np.ones((channel.num_nodes, 2), np.float32))
+    flipped = mixed.pos.copy()
+    flipped[1:, :, 1] = 0.3 - flipped[1:, :, 1]
+    values = [
+        {r.metric: r.value for r in rollout_metrics(replace(own, pos=flipped), own, ["full"])}["energy_distance"]
+        for own in (channel, mixed)
+    ]
+    assert values[0] < 1e-4 < 0.02 < values[1] < np.inf
+
+
 def test_an_exact_rollout_that_ends_empty_has_no_error(channel: Trajectory) -> None:
     assert channel.alive is not None
     empty = replace(channel, alive=channel.alive & (np.arange(41) < 40)[:, None])

@@ -58,6 +58,14 @@ def subject(spec: DatasetSpec, scenes: list[Trajectory], **settings: str) -> Sub
     return Subject("GPE", "sand", simulator, spec, scenes, max_speed=10.0, is_gating=True, horizon_factors=(1.0, 2.0), num_rest_steps=5)
 
 
+@pytest.mark.parametrize("gravity", [(0.0, -9.81), (0.0, 0.0, -9.81), (0.0, -9.81, 0.0), (9.81, 0.0, 0.0)])
+def test_a_quarter_turn_turns_gravity(gravity: tuple[float, ...]) -> None:
+    quarter, pull = invariances.quarter_turn(gravity), torch.tensor(gravity, dtype=torch.float64)
+    assert float(pull @ quarter @ pull) == 0
+    torch.testing.assert_close(quarter @ quarter.T, torch.eye(len(gravity), dtype=torch.float64))
+    assert float(torch.linalg.det(quarter)) == pytest.approx(1.0)
+
+
 def test_all_tests_are_there_once() -> None:
     assert sorted(t.number for tests in GROUPS.values() for t in tests) == list(range(1, 32))
     assert all(t.criterion and t.name for tests in GROUPS.values() for t in tests)
