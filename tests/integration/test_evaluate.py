@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import jaxtyping
 import numpy as np
@@ -329,7 +330,12 @@ def test_the_canyon_is_compared_with_the_solver_and_shown(
     show = [f"data.showcase.{key}" for key in ("num_steps=2", "scene.num_particles=50", "scene.bounds=[[0,3],[0,1.5],[0,1.5]]")]
     smaller = ["data.sizes.tiny.d3.num_particles=50", "data.showcase.scene.reservoir=null", "evaluation.num_pictures=0", *show]
     seen, run = list[LearnedSimulator](), showcase.run
-    monkeypatch.setattr(showcase, "run", lambda simulator, *further: seen.append(simulator) or run(simulator, *further))
+
+    def watched(simulator: LearnedSimulator, *further: Any) -> Any:
+        seen.append(simulator)
+        return run(simulator, *further)
+
+    monkeypatch.setattr(showcase, "run", watched)
     settings = ["evaluation.mirror_average=true", "evaluation.clamp_parameters=false"]
     rows = evaluate(tmp_path, tmp_path, tmp_path / "water.ckpt", "data=fluid", "scene=canyon", *smaller, *settings)
     assert [(own.mirror_average, own.clamps_parameters) for own in seen] == [(True, False)]
