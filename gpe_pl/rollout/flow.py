@@ -33,8 +33,8 @@ def through_openings(before: State, after: State) -> State:
         after: state that a simulator made of it, with the same nodes.
     """
     new, rows = _prescribed(before, after)
-    pos = as_numpy(new.pos)
-    leaves = np.any([opening.removes(pos, before.time, after.time) for opening in after.openings], axis=0)
+    was, pos = as_numpy(before.pos), as_numpy(new.pos)
+    leaves = np.any([opening.removes(was, pos, before.time, after.time) for opening in after.openings], axis=0)
     known: dict[str, Any] = {name: getattr(after, name) for name in ("num_substeps", "num_corrected", "num_asleep", "lost_impulse")}
     if leaves.any():
         new, rows = replace(new.take(np.flatnonzero(~leaves)), **known), rows[~leaves]

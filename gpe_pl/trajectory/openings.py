@@ -127,27 +127,33 @@ class Opening:
 
     def depth_of(self, pos: np.ndarray) -> np.ndarray:
         """Return the distances [node] in m of points [node, dim] from the outer face into the scene; infinite for points beside the opening."""
-        face = self.low[self.axis] if self.inward > 0 else self.high[self.axis]
         others = [axis for axis in range(len(self.low)) if axis != self.axis]
         beside = np.any([(pos[:, a] < self.low[a]) | (pos[:, a] > self.high[a]) for a in others], axis=0)
-        return np.where(beside, np.inf, self.inward * (pos[:, self.axis] - face))
+        return np.where(beside, np.inf, self._way_from_face(pos))
+
+    def _way_from_face(self, pos: np.ndarray) -> np.ndarray:
+        """Return the distances [node] in m of points [node, dim] from the plane of the outer face, negative beyond it."""
+        face = self.low[self.axis] if self.inward > 0 else self.high[self.axis]
+        return np.asarray(self.inward * (pos[:, self.axis] - face))
 
     def contains(self, pos: np.ndarray) -> np.ndarray:
         """Return a mask [node] of the points [node, dim] in the box; the faces along the axis belong to it, also if positions are rounded to float32."""
         depth, margin = self.depth_of(pos), ON_FACE * self.depth
         return np.asarray((depth >= -margin) & (depth <= self.depth + margin))
 
-    def removes(self, pos: np.ndarray, start: float, end: float) -> np.ndarray:
-        """Return a mask [node] of the nodes that leave between two times [s], given their positions at the end ``pos`` [node, dim] in m.
+    def removes(self, before: np.ndarray, pos: np.ndarray, start: float, end: float) -> np.ndarray:
+        """Return a mask [node] of the nodes that leave between two times [s], given their positions [node, dim] in m then, ``before`` and ``pos``.
 
-        Without a speed, those in the box leave. With one, those up to a depth beyond the outer face leave, and with a layer that leaves those nearest to it.
+        Without a speed, those in the box leave. Those that have passed the outer face, up to a depth beyond it, leave in any case. With a layer that leaves, so
+        do those nearest to it. What was beyond the outer face already does not leave.
         """
         depth, limit = self.depth_of(pos), 0.0
         if not self.drives:
             limit = self.depth
         elif self.enters and self._num_layers(end) < self._num_layers(start):
             limit = self._depth_of_layer(-self._num_layers(end), end) - self.spacing / 2
-        return np.asarray((depth >= -self.depth) & (depth < limit))
+        has_passed = (depth >= -self.depth) & (self._way_from_face(before) >= 0)
+        return np.asarray(((depth >= 0) | has_passed) & (depth < limit))
 
     @property
     def num_in_layer(self) -> int:

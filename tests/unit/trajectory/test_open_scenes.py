@@ -48,8 +48,11 @@ def test_nodes_enter_at_the_flow_rate_on_a_lattice_that_moves(side: str) -> None
 def test_an_opening_removes_nodes_by_its_kind() -> None:
     pos = np.array([[0.95, 0.1], [1.02, 0.1], [0.95, 0.4], [0.5, 0.1]])
     outlet = Opening((0.9, 0.0), (1.0, 0.3), "x_high")
-    assert outlet.removes(pos, 0.0, 0.1).tolist() == [True, True, False, False]
-    assert replace(outlet, speed=-1.0).removes(pos, 0.0, 0.1).tolist() == [False, True, False, False]
+    before = pos - [0.05, 0.0]
+    assert outlet.removes(before, pos, 0.0, 0.1).tolist() == [True, True, False, False]
+    assert outlet.removes(pos, pos, 0.0, 0.1).tolist() == [True, False, False, False]  # what was beyond the face does not leave
+    assert replace(outlet, speed=-1.0).removes(before, pos, 0.0, 0.1).tolist() == [False, True, False, False]
+    assert not replace(outlet, speed=-1.0).removes(pos, pos, 0.0, 0.1).any()
     assert len(outlet.entering(0.0, 9.0)) == 0
     assert len(replace(outlet, speed=-1.0, spacing=0.1).entering(0.0, 9.0)) == 0
 
