@@ -111,8 +111,7 @@ def scene_changes(spec: DatasetSpec, index: int) -> dict[str, list[float]]:
         own = positions(spec.label_solver, start, num_frames)
         others = {}
         for name, values in trained_values(spec, index).items():
-            params = with_values(start.material_params, start.node_type, names, values)
-            others[name] = positions(spec.label_solver, replace(start, material_params=params), num_frames)
+            others[name] = positions(spec.label_solver, with_values(start, names, values), num_frames)
         others["half_step"] = positions(HalfSteps(spec.label_solver), start, num_frames)
         rounded = replace(start, pos=np.asarray(start.pos).astype(np.float32).astype(np.float64))
         others["rounded"] = positions(spec.label_solver, rounded, num_frames)

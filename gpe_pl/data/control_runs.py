@@ -25,6 +25,7 @@ from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
 from gpe_pl.system.workers import pool, results
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import StoreError, read_trajectory, trajectory_names, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -41,21 +42,25 @@ def scene_values(spec: DatasetSpec, split: str, index: int) -> dict[str, dict[st
     return parameter_values(spec, split, index)[0]
 
 
-def with_values(material_params: Any, node_type: Any, param_names: Sequence[str], values: Values) -> Any:
-    """Return a copy of the material parameters [node, param] of a scene with other values.
+def with_values(state: State, param_names: Sequence[str], values: Values) -> State:
+    """Return a state with other material parameters, also of the nodes that will enter.
 
     Args:
-        material_params: parameters of the scene, an array or a tensor.
-        node_type: codes of the materials [node].
-        param_names: names of the columns.
+        state: state of arrays or tensors.
+        param_names: names of the columns of its material parameters.
         values: new values. Parameters that are not named keep theirs.
     """
-    new = 1 * material_params
+    params, openings = 1 * state.material_params, list(state.openings)
     for material, parameters in values.items():
-        rows = node_type == node_code(material)
+        rows = state.node_type == node_code(material)
         for name, value in parameters.items():
-            new[rows, param_names.index(name)] = value
-    return new
+            column = param_names.index(name)
+            params[rows, column] = value
+            for k, opening in enumerate(openings):
+                if opening.enters and opening.node_type == node_code(material):
+                    entering = (*opening.params[:column], value, *opening.params[column + 1 :])
+                    openings[k] = replace(opening, params=entering)
+    return replace(state, material_params=params, openings=tuple(openings))
 
 
 @dataclass(frozen=True)
@@ -201,11 +206,12 @@ class ControlRuns:
             return False
         for name, values in self.values(index).items():
             run = runs[name]
-            wanted = with_values(run.material_params, run.node_type, metadata.param_names, values)
             if run.metadata != metadata or run.num_frames != self.spec.num_frames - self.start_frame:
                 return False
-            if not np.array_equal(wanted, run.material_params, equal_nan=True):
-                return False
+            for material, parameters in values.items():
+                own = run.material_params[run.node_type == node_code(material)]
+                if any((own[:, metadata.param_names.index(key)] != own.dtype.type(value)).any() for key, value in parameters.items()):
+                    return False
         return True
 
     def _write(self, index: int) -> None:
@@ -223,9 +229,8 @@ class ControlRuns:
             raise GenerationError(f"{where}: {error}", self.split, index, metadata.seed) from None
         runs = {}
         for name, values in self.values(index).items():
-            params = with_values(state.material_params, state.node_type, metadata.param_names, values)
             num_steps = spec.num_frames - 1 - self.start_frame
-            runs[name] = rollout(spec.label_solver, replace(state, material_params=params), num_steps, metadata, guard)
+            runs[name] = rollout(spec.label_solver, with_values(state, metadata.param_names, values), num_steps, metadata, guard)
             if (stop := runs[name].termination) is not None:
                 raise GenerationError(
                     f"{where}, {name} trained values: {stop.reason}: {stop.message}; evaluate without evaluation.material_controls",

@@ -191,6 +191,4 @@ class MaterialControls:
 
 
 def _changed(start: Start, values: Values) -> Start:
-    state = start.state
-    params = with_values(state.material_params, state.node_type, start.metadata.param_names, values)
-    return replace(start, state=replace(state, material_params=params))
+    return replace(start, state=with_values(start.state, start.metadata.param_names, values))

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from gpe_pl.config.datasets import dataset_spec
-from gpe_pl.data.control_runs import HIGHEST, LOWEST, NEAREST, ControlRuns, TrainedValues, Values, scene_values
+from gpe_pl.data.control_runs import HIGHEST, LOWEST, NEAREST, ControlRuns, TrainedValues, Values, scene_values, with_values
 from gpe_pl.data.ground_truth import DatasetSpec, ParameterValues, generate_trajectory
+from gpe_pl.rollout.baselines import Ballistic
+from gpe_pl.rollout.loop import steps
+from tests.open_scenes import DT, open_state
 from tests.runs import DATA, compose
 
 
@@ -86,6 +89,28 @@ def test_only_missing_and_outdated_runs_are_computed(sand: DatasetSpec, tmp_path
     replace(runs, trained=TrainedValues(replace(sand, parameters=lower))).generate([0])
     assert files[0].read_bytes() != before[0] and files[1].read_bytes() == before[1]
     assert (replace(runs).read(0)[LOWEST].material_params == 10.0).all()
+
+
+def test_what_enters_has_the_new_values_too() -> None:
+    before = open_state()
+    state = with_values(before, ("friction_angle",), {"sand": {"friction_angle": 20.0}})
+    assert [opening.params for opening in before.openings] == [(30.0,), (40.0,), ()]
+    *_, after = steps(Ballistic(DT), state, 10)
+    assert len(set(np.asarray(after.node_id).tolist()) - set(range(before.num_nodes)))
+    assert (np.asarray(after.material_params) == 20.0).all()
+
+
+@pytest.mark.slow
+def test_runs_of_open_scenes_are_complete(tmp_path: Path) -> None:
+    channel = spec_of("data=channel", "dimension=2", "data.num_frames=15")
+    runs = ControlRuns(tmp_path / "channel" / "tiny", channel, TrainedValues(channel), "test_unseen", 4)
+    runs.generate([0])
+    reported: list[tuple[int, int]] = []
+    runs.generate([0], 1, lambda done, total: reported.append((done, total)))
+    assert reported == [(1, 1)]  # nothing is missing
+    for name in (LOWEST, HIGHEST):
+        (own,) = np.unique(runs.read(0)[name].material_params)
+        assert own == pytest.approx(value(TrainedValues(channel).end(name)))
 
 
 def test_values_of_a_scene_are_named(sand: DatasetSpec) -> None:
