@@ -19,10 +19,10 @@ from torch.utils.data import Dataset
 from torch_geometric.data import HeteroData
 
 from gpe_pl.data.augmentation import Augmentation
+from gpe_pl.data.damage import damage
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.open_windows import check_settings, continued
 from gpe_pl.data.solver_targets import SolverTargets
-from gpe_pl.data.statistics import FRAMES_AT_ONCE
 from gpe_pl.data.training_samples import Unroll, UnrollStart, training_graph
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
@@ -80,12 +80,8 @@ CACHE_BYTES = 2 * 1024**3
 """A split is cached in memory if its compressed files have at most half this size [bytes]. Larger splits are read from disk window by window. Cached graphs may
 take this much memory, too."""
 
-
 MAX_DAMAGED = 0.2
 """Maximum fraction of a split's trajectories that may be left out. One trajectory may always be left out."""
-MAX_JUMP, MIN_RATIO = 2.0, 10.0
-"""A node that moves more than MAX_JUMP connectivity radii in one frame, and more than MIN_RATIO times as far as in the frame before or after, marks corrupt
-data."""
 
 
 @dataclass(frozen=True)
@@ -230,62 +226,6 @@ def usable(trajectories: list[StoredTrajectory], stride: int = 1) -> list[Stored
             f"{where}: {num_damaged} of {len(trajectories)} trajectories cannot be used; see the warnings above, then generate or import the data again"
         )
     return found
-
-
-def damage(trajectory: Trajectory, stride: int = 1) -> str | None:
-    """Return why nothing can be learned from a trajectory whose values are valid, with frame and node if there is one. None means that it can be used.
-
-    Args:
-        trajectory: trajectory with all stored frames.
-        stride: number of stored frames in a frame of the model.
-    """
-    pos, metadata = trajectory.pos, trajectory.metadata
-    if trajectory.num_nodes == 0:
-        return "it has no nodes"
-    if trajectory.alive is not None and (fault := _open_fault(trajectory, trajectory.alive, stride)) is not None:
-        return fault
-    bounds = np.array(metadata.bounds)
-    width = np.ptp(bounds, axis=1)
-    low, high = (
-        limits.astype(pos.dtype) for limits in (bounds[:, 0] - width, bounds[:, 1] + width)
-    )  # converting positions instead would copy a long trajectory
-    near = (pos >= low) & (pos <= high)
-    if not near.all():
-        frame, node = np.argwhere(~near)[0, :2]
-        return f"the position of node {node} in frame {frame} lies outside the domain by more than its width"
-    return _jump(trajectory)
-
-
-def _open_fault(trajectory: Trajectory, alive: np.ndarray, stride: int) -> str | None:
-    """Return why nothing can be learned from an open scene; None if it can be used."""
-    if not alive.any(axis=1).all():
-        return f"no node is in the scene in frame {int(alive.any(axis=1).argmin())}"
-    if trajectory.stress is not None:
-        return "its nodes enter and leave, and some have a stress"
-    inlets = sum(opening.enters for opening in trajectory.openings)
-    if stride > 1 and inlets > 1:
-        return f"its {inlets} inlets give nodes other numbers with data.stride={stride}"
-    return None
-
-
-def _jump(trajectory: Trajectory) -> str | None:
-    """Describe the first node that moves farther than ``MAX_JUMP`` radii between two frames, but hardly moves before or after them; None if there is none.
-
-    A node that is really fast is fast for several frames. A single corrupt frame would give the largest acceleration of the data set and distort its scale.
-    """
-    limit = MAX_JUMP * trajectory.metadata.connectivity_radius
-    for start in range(0, trajectory.num_frames - 1, FRAMES_AT_ONCE):
-        first = max(0, start - 1)
-        pos = trajectory.pos[first : start + FRAMES_AT_ONCE + 2].astype(np.float64)
-        way = np.linalg.norm(integrators.velocities(pos, 1.0, trajectory.metadata.periodicity), axis=-1)
-        before, after = np.full_like(way, np.inf), np.full_like(way, np.inf)
-        before[1:], after[:-1] = way[:-1], way[1:]
-        jumps = np.argwhere((way > limit) & (np.minimum(before, after) < way / MIN_RATIO))
-        if len(jumps):
-            frame, node = jumps[0]
-            where = f"between frames {first + frame} and {first + frame + 1}"
-            return f"node {node} jumps by {way[frame, node]:.3g} m {where}"
-    return None
 
 
 def _read_only(trajectory: Trajectory) -> Trajectory:

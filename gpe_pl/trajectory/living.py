@@ -56,6 +56,27 @@ def columns(
     return held(values, alive), alive, known
 
 
+def order_of_entry(
+    alive: Bool[np.ndarray, "frame node"], pos: Float[np.ndarray, "frame node dim"], stride: int, openings: Sequence[Opening]
+) -> Int[np.ndarray, " node"]:
+    """Return the numbers of the columns of a trajectory in the order in which a rollout with ``stride`` times longer frames numbers the nodes.
+
+    In each frame, nodes of the first inlet enter before those of the second.
+
+    Args:
+        alive, pos: frames of the trajectory.
+        stride: number of its frames in a longer one.
+        openings: its inlets and outlets. Inlets do not overlap.
+    """
+    count = alive.shape[1]
+    first = alive.argmax(axis=0)
+    entry = pos[first, np.arange(count)]
+    inlet = np.zeros(count, np.int64)
+    for number, opening in enumerate(openings):
+        inlet[opening.contains(entry) & (first > 0)] = number
+    return np.lexsort((np.arange(count), inlet, -(-first // stride)))
+
+
 def held(values: np.ndarray, alive: Bool[np.ndarray, "frame node"]) -> np.ndarray:
     """Return values [frame, node, …] in which a node that is not in the scene has the value of the nearest frame in which it is."""
     first, last = alive.argmax(axis=0), len(alive) - 1 - alive[::-1].argmax(axis=0)

@@ -33,7 +33,7 @@ from gpe_pl.trajectory.arrays import (
 )
 from gpe_pl.trajectory.boundary import Array, Boundary, check_steps, has_nodes_beside_shapes
 from gpe_pl.trajectory.cells import mean_over_corners
-from gpe_pl.trajectory.living import held, living
+from gpe_pl.trajectory.living import held, living, order_of_entry
 from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State, Stress
@@ -478,7 +478,8 @@ class Trajectory:
     def every(self, stride: int) -> Trajectory:
         """Return every ``stride``-th frame, from the first on, as a trajectory whose frames are ``stride`` times as long.
 
-        Velocities of nodes stay those at the frames. Boundary nodes get their mean velocities over the longer frames, and forces are averaged, too.
+        Velocities of nodes stay those at the frames. Boundary nodes get their mean velocities over the longer frames, and forces are averaged, too. Nodes
+        that enter are numbered as a rollout with the longer frames numbers them.
 
         Raises:
             ValueError: ``stride`` is not a positive whole number.
@@ -491,7 +492,7 @@ class Trajectory:
         pos, vel = (
             values[::stride] if self.alive is None else held(values[::stride], self.alive[::stride]) for values in (self.pos, self.vel)
         )
-        return replace(
+        longer = replace(
             self,
             metadata=self.metadata.every(stride),
             pos=pos,
@@ -501,7 +502,10 @@ class Trajectory:
             alive=None if self.alive is None else self.alive[::stride],
             force=None if self.force is None else _mean_over(self.force, stride),
             termination=None if stop is None else replace(stop, frame=-(-stop.frame // stride)),
-        ).present()
+        )
+        if self.alive is not None and sum(opening.enters for opening in self.openings) > 1:
+            longer = longer.of_nodes(order_of_entry(self.alive, self.pos, stride, self.openings))
+        return longer.present()
 
     def present(self) -> Trajectory:
         """Return the trajectory without nodes that are in the scene in no frame; the same object if there are none."""
@@ -511,7 +515,7 @@ class Trajectory:
         return self if some.all() else self.of_nodes(some)
 
     def of_nodes(self, nodes: np.ndarray) -> Trajectory:
-        """Return some of the nodes, given by a mask [node], of a trajectory without mesh."""
+        """Return some of the nodes, given by a mask [node] or by their numbers in a new order, of a trajectory without mesh."""
         names = ("node_type", "mass", "material_params", "rigid_body", "prescribed")
         per_node = {name: getattr(self, name) for name in names}
         return replace(

@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 
 from gpe_pl.data.validate import validate
+from gpe_pl.metrics import per_frame_mse
 from gpe_pl.metrics.open_scenes import entering, leaving, ledger, present
+from gpe_pl.rollout.baselines import Ballistic
+from gpe_pl.rollout.loop import rollout
 from gpe_pl.trajectory.openings import Opening, openings_fault, openings_from_json, openings_to_json
 from gpe_pl.trajectory.store import StoreError, read_trajectory, write_shard
-from tests.open_scenes import DT, GRAVITY, OPENINGS, OUTLET, STEADY, TURNING, open_trajectory
+from tests.open_scenes import DT, GRAVITY, OPENINGS, OUTLET, STEADY, TURNING, open_state, open_trajectory
 
 RAMP = Opening((0.0, 0.0), (0.3, 0.2), "x_low", None, 0.1, 0, 2.0, (30.0,), ((0.0, 0.0), (1.0, 1.0), (3.0, -1.0)))
 
@@ -49,8 +52,8 @@ def test_layers_enter_and_leave_with_the_speed() -> None:
     counts = [len(present)]
     for k in range(68):
         start, end = k * dt, (k + 1) * dt
-        present = present + dt * RAMP.mean_velocity(start, end)
-        present = present[~RAMP.removes(present, start, end)]
+        before, present = present, present + dt * RAMP.mean_velocity(start, end)
+        present = present[~RAMP.removes(before, present, start, end)]
         present = np.concatenate([present, RAMP.entering(start, end)])
         depth = np.unique(np.round(RAMP.depth_of(present), 9))
         assert 0 <= depth[0] < 0.1 + 1e-6
@@ -68,7 +71,7 @@ def test_what_was_drawn_in_does_not_lie_on_new_layers() -> None:
     for k in range(150):
         start, end = k * dt, (k + 1) * dt
         way = dt * zone.mean_velocity(start, end)
-        kept = [group[~zone.removes(group + way, start, end)] + way for group in (foreign, layers)]
+        kept = [group[~zone.removes(group, group + way, start, end)] + way for group in (foreign, layers)]
         foreign, layers = kept[0], np.concatenate([kept[1], zone.entering(start, end)])
         if len(foreign) and len(layers):
             closest = min(closest, float(np.abs(foreign[:, None, 0] - layers[None, :, 0]).min()))
@@ -145,3 +148,22 @@ def test_faults_of_tables_are_named(tmp_path: Path, changes: dict[str, object], 
         file["00000"].attrs["openings"] = np.bytes_(openings_to_json([wrong]).replace("NaN", "1e300").encode())
     with pytest.raises(StoreError, match="opening 1: "):
         read_trajectory(path, "00000")
+
+
+@pytest.mark.parametrize("stride", [2, 4])
+def test_longer_frames_number_nodes_as_a_rollout_with_longer_frames_does(stride: int) -> None:
+    """Two inlets take turns within a longer frame."""
+    start = replace(open_state(), gravity=np.zeros(2)).opened((STEADY, replace(TURNING, speeds=((0.0, 0.8),))))
+    metadata = open_trajectory(3).metadata
+    short, long = (
+        rollout(
+            Ballistic(DT * k), replace(start, velocity_history=np.asarray(start.vel)[:, None]), 24 // k, replace(metadata, frame_dt=DT * k)
+        )
+        for k in (1, stride)
+    )
+    found = short.every(stride)
+    assert found.num_nodes == long.num_nodes > start.num_nodes
+    assert found.alive is not None
+    assert long.alive is not None
+    np.testing.assert_array_equal(found.alive, long.alive)
+    assert float(per_frame_mse(long, found).max()) < 1e-12
