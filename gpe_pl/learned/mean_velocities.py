@@ -14,6 +14,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.islands import Islands, islands_within
 from gpe_pl.graphs.search import walls_of
 from gpe_pl.trajectory.cells import cell_edges
+from gpe_pl.trajectory.openings import carried
 from gpe_pl.trajectory.rigid_bodies import bodies_of
 from gpe_pl.trajectory.state import State
 
@@ -36,8 +37,8 @@ def _rigid_edges(state: State) -> np.ndarray:
 def history_at_start(state: State, builder: GraphBuilder) -> Tensor:
     """Return the velocity history of a state without earlier frames [node, history, dim] in m/s, oldest first.
 
-    Nodes of islands that no wall touches and no given motion moves have flown freely. Others have had their present velocity. So have all nodes for models
-    with the elastic law, which starts from velocities at the instant.
+    Nodes of islands that touch no wall, and that no given motion and no opening moves, have flown freely. Others have had their present velocity. So have all
+    nodes for models with the elastic law, which starts from velocities at the instant.
 
     Args:
         state: state of tensors, with velocities at its instant.
@@ -50,6 +51,7 @@ def history_at_start(state: State, builder: GraphBuilder) -> Tensor:
     is_free = islands.is_free.copy()
     if state.loads is not None:
         is_free[islands.label[state.loads.rows]] = False
+    is_free[islands.label[carried(state.openings, state.pos.detach().cpu().numpy())]] = False
     flies = torch.from_numpy(is_free[islands.label]).to(state.vel.device)
     age = torch.arange(count, 0, -1, dtype=state.vel.dtype, device=state.vel.device) - 0.5
     fallen = flies[:, None, None] * (age * builder.metadata.frame_dt)[:, None] * state.gravity.to(state.vel)
