@@ -304,6 +304,8 @@ class Scene:
             SceneFault: the scene is impossible, or does not fit the model.
         """
         own = simulator.builder.metadata
+        if any(zone.has_rate and zone.body is not None for zone in self.zones):
+            return replace(self, zones=tuple(zone.at_spacing(own.spacing) for zone in self.zones)).state(simulator)
         if any(own.periodic):
             raise SceneFault({"model": "is for a periodic domain; scenes have walls"})
         if own.dim != self.dim:
@@ -432,7 +434,8 @@ class Scene:
         low, lengths = self._vector(name, "at", at), self._vector(name, "size", size)
         self._positive(name, "size", *lengths.tolist())
         try:
-            return Zone(name, low, low + lengths, side, speed_of(low, low + lengths, side, speed, flow_rate, is_inlet))
+            given = speed_of(low, low + lengths, side, speed, flow_rate, is_inlet)
+            return Zone(name, low, low + lengths, side, given, has_rate=flow_rate is not None)
         except BodyFault as fault:
             raise SceneFault({name: str(fault)}) from None
 

@@ -29,6 +29,7 @@ class Zone:
         side: side of the box that is the outer face, such as ``x_low``.
         speed: speed into the scene [m/s], negative out of it, or a table of times and speeds; None for an outlet that removes what reaches it.
         body: material, velocity and parameters of what enters; None for outlets.
+        has_rate: whether the speed follows from a flow rate and the area of the cross-section.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Zone:
     side: str
     speed: float | Table | None
     body: Body | None = None
+    has_rate: bool = False
 
     @property
     def opening(self) -> Opening:
@@ -44,6 +46,17 @@ class Zone:
         table = self.speed if isinstance(self.speed, tuple) else ()
         steady = None if isinstance(self.speed, tuple) else self.speed
         return Opening(tuple(self.low.tolist()), tuple(self.high.tolist()), self.side, steady, speeds=table)
+
+    def at_spacing(self, spacing: float) -> Zone:
+        """Return the zone with the speed at which nodes ``spacing`` [m] apart carry its flow rate: a layer has a whole number of them per line."""
+        if not self.has_rate or self.body is None:
+            return self
+        opening = replace(self.opening, spacing=spacing)
+        area = float(np.prod(np.delete(self.high - self.low, opening.axis)))
+        factor = area / (opening.num_in_layer * spacing ** (len(self.low) - 1))
+        speed = tuple((t, factor * v) for t, v in self.speed) if isinstance(self.speed, tuple) else factor * (self.speed or 0.0)
+        new = replace(self, speed=speed, has_rate=False)
+        return replace(new, body=replace(self.body, velocity=new.opening.velocity_at(0.0)))
 
 
 def speed_of(low: np.ndarray, high: np.ndarray, side: str, speed: Any, flow_rate: Any, is_inlet: bool) -> float | Table | None:

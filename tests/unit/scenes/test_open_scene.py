@@ -52,6 +52,28 @@ def test_a_flow_rate_is_a_speed_times_a_cross_section() -> None:
     assert [opening.speed for opening in state.openings] == [pytest.approx(2.0), pytest.approx(-0.5)]
 
 
+@pytest.mark.parametrize("width", [0.2, 0.13, 1.9 * SPACING])
+def test_a_flow_rate_is_kept_whatever_the_width(width: float) -> None:
+    """Layers have a whole number of nodes per line, so the speed makes up for the rest of the width."""
+    state, metadata = tap(speed=None, flow_rate=0.05, size=(width, 0.125)).state(model())
+    inlet, *_ = state.openings
+    assert inlet.speed is not None
+    assert inlet.num_in_layer * SPACING * inlet.speed == pytest.approx(0.05)
+    np.testing.assert_allclose(state.vel, inlet.velocity_at(0.0)[None].repeat(state.num_nodes, 0))
+    entered = sum(len(inlet.entering(k * metadata.frame_dt, (k + 1) * metadata.frame_dt)) for k in range(400))
+    assert entered * inlet.mass == pytest.approx(1600 * 0.05 * 400 * metadata.frame_dt, abs=inlet.num_in_layer * inlet.mass)
+
+
+def test_what_an_inlet_moves_has_not_fallen_before_the_start() -> None:
+    state, metadata = tap(at=(0.4, 0.6), size=(0.2, 0.2)).block("sand", at=(0.1, 0.4), size=(0.1, 0.1)).state(model())
+    history = model().standing(state, metadata).velocity_history
+    assert history is not None
+    inside = state.openings[0].contains(state.pos)
+    assert inside.any() and not inside.all()
+    assert (history[inside, :, 1] == -1.5).all()
+    assert (history[~inside, :, 1] > 0).all()  # upward, before gravity brought it to rest at the start
+
+
 def test_tables_of_speeds_and_flow_rates() -> None:
     table = [[0, 0.25], [1, 0.5], [2, -0.125]]
     state, _ = tap(speed=None, flow_rate=table).outlet(**OUTLET, speed=[(0, 0), (1, 2)]).state(model())
