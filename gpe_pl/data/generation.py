@@ -30,8 +30,8 @@ import numpy as np
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.chosen_scenes import SPEC_FILE, scene_numbers
 from gpe_pl.data.ground_truth import DatasetSpec, GenerationError, generate_trajectory, initial_state, trajectory_metadata
-from gpe_pl.data.position_rounding import ROUNDING_FRACTION, motion_of, rounding_fault, rounding_of
-from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
+from gpe_pl.data.position_rounding import ROUNDING_FRACTION, rounding_fault, rounding_of
+from gpe_pl.data.statistics import STATISTICS_FILE, acceleration_std, combined, shard_moments
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import free_bytes, replace_text
 from gpe_pl.files.run_folder import refuse_links, without_orphans
@@ -253,7 +253,7 @@ def check_rounding(spec: DatasetSpec) -> None:
     if rounding <= ROUNDING_FRACTION * float(np.linalg.norm(spec.scene.gravity)):  # nodes that meet a wall accelerate at least as much
         return
     trajectory = generate_trajectory(spec, "train", 0)
-    acceleration = motion_of(trajectory.metadata, trajectory.pos).acceleration
+    acceleration = acceleration_std([trajectory])
     if fault := rounding_fault(rounding, acceleration):
         message = f"frame_dt = {dt:g} s: {fault}; choose a longer frame_dt (data.solver.frame_dt=…), or bounds nearer to 0"
         if rounding > ROUNDING_REFUSED * acceleration:

@@ -238,6 +238,19 @@ def test_accelerations_that_would_be_rounding_are_refused_before_they_are_stored
     assert not list(tmp_path.iterdir())
 
 
+def test_jumps_of_nodes_that_enter_are_no_accelerations(tmp_path, monkeypatch):
+    """A node that is held in place until it enters at 50 m/s would hide that rounding exceeds all accelerations of those in the scene."""
+    truth = generate_trajectory(SPEC, "train", 0)
+    still = np.repeat(truth.pos[:1], truth.num_frames, axis=0)
+    still[10:, 0, 0] += 50.0 * SOLVER.frame_dt * np.arange(truth.num_frames - 10)
+    alive = np.ones(still.shape[:2], bool)
+    alive[:10, 0] = False
+    gravity = replace(truth.metadata, gravity=(0.0, 0.0))
+    monkeypatch.setattr(generation, "generate_trajectory", lambda *_: replace(truth, metadata=gravity, pos=still, alive=alive))
+    with pytest.raises(GenerationError, match=r"round accelerations by .* those of the data are 0 m/s² rms"):
+        generate(tmp_path, replace(SPEC, solver=replace(SOLVER, frame_dt=2e-5)))
+
+
 def test_complete_data_set_is_left_alone(folder):
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
     seen = []
