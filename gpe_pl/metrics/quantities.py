@@ -66,8 +66,9 @@ def quantities(trajectory: Trajectory) -> dict[str, Quantity]:
         found["elastic energy"] = Quantity("J", energy[1:])
     strength = float(np.linalg.norm(gravity))
     up = -gravity / strength if strength else np.zeros(len(gravity))
-    out = _run_out(_way_from_centre(trajectory, motion.pos), trajectory.mass, up)
-    found["run-out"] = Quantity("m", out, float(out[-1]))
+    if _has_a_middle(trajectory, up):
+        out = _run_out(_way_from_centre(trajectory, motion.pos), trajectory.mass, up)
+        found["run-out"] = Quantity("m", out, float(out[-1]))
     if strength:
         height = (motion.centre - motion.centre[0]) @ up
         rise = _rise(height)
@@ -97,6 +98,20 @@ def _of_open_scene(trajectory: Trajectory) -> dict[str, Quantity]:
         "mass": Quantity("kg", book.mass[1:], float(book.mass[-1])),
         "outflow": Quantity("kg", left, float(left[-1])),
     }
+
+
+def _has_a_middle(trajectory: Trajectory, up: Float[np.ndarray, "dim"]) -> bool:
+    """Whether the first frame is narrower than half of the domain along each periodic axis that has a horizontal part. Otherwise it has no centre of mass."""
+    space = trajectory.metadata.periodicity
+    if space is None or not trajectory.num_nodes:
+        return True
+    for axis in space.axes:
+        period = float(space.period[axis])
+        sorted_pos = np.sort(trajectory.pos[0, :, axis].astype(np.float64) % period)
+        widest_gap = max(float(np.diff(sorted_pos, append=sorted_pos[0] + period).max()), 0.0)
+        if abs(up[axis]) < 1 - 1e-9 and period - widest_gap >= 0.5 * period:
+            return False
+    return True
 
 
 def _way_from_centre(trajectory: Trajectory, pos: Float[np.ndarray, "frame node dim"]) -> Float[np.ndarray, "frame node dim"]:

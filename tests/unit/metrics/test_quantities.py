@@ -74,6 +74,18 @@ def test_crossing_the_seam_of_a_periodic_domain_is_no_jump() -> None:
     assert found["run-out"].value == pytest.approx(plain["run-out"].value, rel=1e-4)
 
 
+@pytest.mark.parametrize(("width", "is_there"), [(9.0, True), (11.0, False), (20.0, False)])
+def test_run_out_needs_material_that_is_narrower_than_half_of_a_periodic_domain(width: float, is_there: bool) -> None:
+    pos = np.zeros((3, 40, 2))
+    pos[..., 0] = (np.linspace(5.0, 5.0 + width, 40, endpoint=False) + 10.0) % 20.0 - 10.0
+    pos[..., 1] = 0.1 * np.arange(40)
+    orders = (np.arange(40), np.random.default_rng(0).permutation(40))
+    found = [quantities(moving(pos[:, order], periodic=(True, False))) for order in orders]
+    assert [("run-out" in own) for own in found] == [is_there, is_there]
+    if is_there:
+        assert found[0]["run-out"].value == pytest.approx(found[1]["run-out"].value)
+
+
 def test_peak_stress_is_the_largest_of_all_nodes_and_frames() -> None:
     trajectory = moving(falling(6))
     node = np.zeros((6, 4, 4), np.float32)
