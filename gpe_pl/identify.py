@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
@@ -167,6 +168,11 @@ def _calibrations(cfg: DictConfig, settings: Settings) -> tuple[dict[str, dict[s
                 found.setdefault(kind, {})[name] = calibrated(known, settings.level)
             except FewScenesError as error:
                 raise ConfigError(f"{key}: {name} by simulator={kind}: {error}") from None
+            if not math.isfinite(found[kind][name].threshold):
+                raise ConfigError(
+                    f"{key}: {name} by simulator={kind}: too many calibration scenes have true values beyond the bounds of the search, so no interval of "
+                    f"{100 * settings.level:g} % has an end; calibrate on scenes within the bounds, or with wider bounds"
+                )
     return found, {answer.observed for own in answers.values() for answer in own}
 
 

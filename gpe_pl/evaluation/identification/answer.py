@@ -158,10 +158,10 @@ def value_of(unknown: Unknown, z: float, profile: Profile, calibration: Calibrat
         unknown: the unknown.
         z: its value with the smallest misfit, as a number from 0 to 1.
         profile: misfits of other values.
-        calibration: correction and interval.
+        calibration: correction and interval. Values that are impossible become the nearest possible ones.
     """
     raw = float(unknown.at(z))
-    estimate, low, high = map(unknown.value, calibration.interval(unknown.coordinate(raw), profile))
+    estimate, low, high = (unknown.possible(unknown.value(end)) for end in calibration.interval(unknown.coordinate(raw), profile))
     text = f"{unknown.text(estimate)} ({100 * calibration.level:g} %: {low:.3g}–{high:.3g})"
     if unknown.unit == "Pa":
         text = f"{unknown.text(estimate)} ({100 * calibration.level:g} %: {unknown.text(low)}–{unknown.text(high)})"

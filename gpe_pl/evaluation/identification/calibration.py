@@ -49,7 +49,7 @@ class Calibration:
 
     Attributes:
         offset, slope: the corrected answer is ``offset + slope · answer``.
-        threshold: largest misfit above the smallest within an interval.
+        threshold: largest misfit above the smallest within an interval. It is infinite if too many calibration scenes have true values beyond the bounds.
         num_scenes: number of calibration scenes; 0 if there was no calibration.
         level: nominal coverage.
     """
@@ -61,8 +61,9 @@ class Calibration:
     level: float = 0.9
 
     def interval(self, estimate: float, profile: Profile) -> tuple[float, float, float]:
-        """Return the corrected answer and the ends of its interval, in the coordinate."""
-        center, low, high = (self.offset + self.slope * end for end in (estimate, *profile.within(self.threshold)))
+        """Return the corrected answer and the ends of its interval, in the coordinate. They are infinite if the threshold is."""
+        ends = profile.within(self.threshold) if np.isfinite(self.threshold) else (-np.inf, np.inf)
+        center, low, high = (self.offset + self.slope * end for end in (estimate, *ends))
         return center, low, high
 
 

@@ -81,9 +81,13 @@ class Observations:
 
     @classmethod
     def of(cls, trajectory: Trajectory, settings: ObservationSettings | None = None) -> Observations:
-        """Return the observations that settings choose from a complete trajectory; by default everything is observed."""
+        """Return the observations that settings choose from a complete trajectory; by default everything is observed.
+
+        Hidden nodes and noise depend on the seed and on the motion, so they differ between scenes.
+        """
         s = settings or ObservationSettings()
-        rng, (num_frames, num_nodes) = np.random.default_rng(s.seed), trajectory.pos.shape[:2]
+        motion = int(digest({"pos": trajectory.pos}, attributes={})[:16], 16)
+        rng, (num_frames, num_nodes) = np.random.default_rng([s.seed, motion]), trajectory.pos.shape[:2]
         seen = np.zeros((num_frames, num_nodes), dtype=bool)
         seen[:: s.every] = rng.permutation(num_nodes) < max(1, round(s.nodes * num_nodes))
         if s.added_noise:

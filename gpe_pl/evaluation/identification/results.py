@@ -29,7 +29,7 @@ from gpe_pl.evaluation.identification.observations import Observations, Observat
 from gpe_pl.evaluation.identification.pictures import misfit_figure
 from gpe_pl.evaluation.identification.scene import SolverError, identify_parameters, solver_bounds, solver_of, trained_bounds
 from gpe_pl.evaluation.identification.search import SearchSettings
-from gpe_pl.evaluation.identification.shooting import ShootingSettings
+from gpe_pl.evaluation.identification.shooting import ShootingSettings, started
 from gpe_pl.evaluation.identification.unknowns import Bounds, Unknowns, unknowns_of
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
@@ -122,9 +122,9 @@ class Task:
             simulator: Simulator = self.model if kind == MODEL else solver_of(trajectory.metadata)
             if kind == MODEL:
                 model = self.model.configured(clamps_parameters=False)
-                start = trajectory.state(0) if sought.needs_start else None
-                state = model.initial_state(trajectory, first) if start is None else model.standing(start, trajectory.metadata)
-                shown[kind] = rollout(model, sought.applied(state, torch.from_numpy(z)), number, trajectory.metadata)
+                state = trajectory.state(0).to_torch() if sought.needs_start else model.initial_state(trajectory, first)
+                start = started(model, sought, state, torch.from_numpy(z), trajectory.metadata)
+                shown[kind] = rollout(model, start, number, trajectory.metadata)
             else:
                 run = rollout(simulator, sought.applied(trajectory.state(0), z), first + number, trajectory.metadata)
                 shown[kind] = replace(run, is_prediction=True).frames(first, run.num_frames)

@@ -24,6 +24,7 @@ from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import Restartable, Simulator, unfit
 from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata
 
 FLOOR = 1e-6
 """Squared displacement below which motions count as equal [spacings²]."""
@@ -59,7 +60,7 @@ class Shooting:
         simulator: a learned simulator or a solver.
         observations: observed motion.
         unknowns: what is sought.
-        starts: starting state of each window by its frame.
+        starts: starting state of each window by its frame. If an initial velocity is sought by a model, it has no history yet.
         length: number of frames of each window.
         block: number of frames whose misfits count as one sample of the uncertainty.
         num_evaluations, num_gradients: numbers of calls so far.
@@ -112,7 +113,8 @@ class Shooting:
         return misfit.item(), gradient.numpy()
 
     def _errors(self, z: Any) -> list[list[Any]]:
-        states = {frame: self.unknowns.applied(state, z) for frame, state in self.starts.items()}
+        metadata = self.observations.trajectory.metadata
+        states = {frame: started(self.simulator, self.unknowns, state, z, metadata) for frame, state in self.starts.items()}
         errors: dict[int, list[Any]] = {frame: [FAILED] * self.length for frame in states}
         for frame in states:
             for k in range(1, self.length + 1):
@@ -177,16 +179,19 @@ def shooting(simulator: Simulator, observations: Observations, unknowns: Unknown
         raise ShootingError(f"no frame within shooting.horizon={s.horizon} of the starts {frames} is observed; choose a longer horizon")
     if isinstance(simulator, LearnedSimulator):
         simulator = simulator.configured(clamps_parameters=False)
-        thrown = unknowns.needs_start
-        starts = {
-            f: simulator.standing(completed.state(f), completed.metadata) if thrown else simulator.initial_state(completed, f)
-            for f in frames
-        }
+        device = simulator.acceleration_std.device
+        starts = {f: completed.state(f).to_torch(device) if unknowns.needs_start else simulator.initial_state(completed, f) for f in frames}
     else:
         starts = {f: completed.state(f) for f in frames}
         if can_restart:
             starts = {f: simulator.restarted(state) if f > 0 else state for f, state in starts.items()}  # type: ignore[attr-defined]
     return Shooting(simulator, observations, unknowns, starts, length, min(s.horizon, length))
+
+
+def started(simulator: Simulator, unknowns: Unknowns, state: State, z: Any, metadata: Metadata) -> State:
+    """Return the start of a rollout with the values at ``z`` [unknown]. If a model's initial velocity is sought, its history follows from that velocity."""
+    new = unknowns.applied(state, z)
+    return simulator.standing(new, metadata) if isinstance(simulator, LearnedSimulator) and unknowns.needs_start else new
 
 
 def _block_numbers(num_windows: int, num_frames: int, block: int) -> np.ndarray:

@@ -93,14 +93,22 @@ class Unknown:
 
     def text(self, value: float) -> str:
         """Return a value with its unit."""
-        parameter = next(
-            (p for own in MATERIALS.values() for p in own if self.kind == "parameter" and p.name == self.name_of_parameter), None
-        )
+        parameter = self._parameter
         return f"{value:.3g} {self.unit}" if parameter is None else parameter_value(parameter, float(f"{value:.3g}"))
 
+    def possible(self, value: float) -> float:
+        """Return the value nearest to another one that is within the limits of the solvers or the bounds, whichever are wider."""
+        parameter = self._parameter
+        if parameter is None:
+            return value
+        return min(max(value, min(self.low, parameter.limits.low)), max(self.high, parameter.limits.high))
+
     @property
-    def name_of_parameter(self) -> str:
-        return self.name.partition(".")[2].partition("#")[0]
+    def _parameter(self) -> MaterialParameter | None:
+        """The material parameter that is sought; None for a velocity or a direction."""
+        material, _, rest = self.name.partition(".")
+        own = MATERIALS.get(material, ()) if self.kind == "parameter" else ()
+        return next((parameter for parameter in own if parameter.name == rest.partition("#")[0]), None)
 
 
 @dataclass(frozen=True)
@@ -118,9 +126,11 @@ class Unknowns:
         return any(u.kind == VELOCITY for u in self.items)
 
     def applied(self, state: State, z: Any) -> State:
-        """Return a state with the values at ``z`` [unknown]; all arrays are of the same library. Gradients pass to ``z``."""
+        """Return a state with the values at ``z`` [unknown]; all arrays are of the same library. Gradients pass to ``z``.
+
+        A state whose velocity is sought has no velocity history.
+        """
         params, vel, gravity = 1 * state.material_params, 1 * state.vel, 1 * state.gravity
-        history = None if state.velocity_history is None else 1 * state.velocity_history
         tilted = 0 * gravity
         for k, unknown in enumerate(self.items):
             value = unknown.at(z[k])
@@ -128,15 +138,13 @@ class Unknowns:
                 params[unknown.nodes, unknown.place] = value
             elif unknown.kind == VELOCITY:
                 vel[unknown.nodes, unknown.place] = value
-                if history is not None:
-                    history[unknown.nodes, :, unknown.place] = value
             else:
                 tilted = tilted + array_namespace(z).tan(value * (math.pi / 180)) * _across(gravity, unknown.place)
         if any(u.kind == GRAVITY for u in self.items):
             size = (gravity**2).sum() ** 0.5
             gravity = gravity + size * tilted
             gravity = gravity * (size / (gravity**2).sum() ** 0.5)
-        return replace(state, material_params=params, vel=vel, velocity_history=history, gravity=gravity)
+        return replace(state, material_params=params, vel=vel, gravity=gravity)
 
 
 def _across(gravity: Any, axis: int) -> Any:

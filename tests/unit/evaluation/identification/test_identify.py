@@ -22,8 +22,8 @@ from gpe_pl.evaluation.identification.profile import Profile
 from gpe_pl.evaluation.identification.results import MotionError, Task, write_table
 from gpe_pl.evaluation.identification.scene import SolverError, identify_parameters, solver_of
 from gpe_pl.evaluation.identification.search import SearchSettings
-from gpe_pl.evaluation.identification.shooting import Shooting, ShootingError, ShootingSettings, shooting
-from gpe_pl.evaluation.identification.unknowns import UnknownError, unknowns_of
+from gpe_pl.evaluation.identification.shooting import FLOOR, Shooting, ShootingError, ShootingSettings, shooting
+from gpe_pl.evaluation.identification.unknowns import Unknown, UnknownError, unknowns_of
 from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.files import sealed
 from gpe_pl.identify import Settings, _calibrations, _identity, identify_all
@@ -31,6 +31,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.conformal import interval_score
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.loop import SimulationError, rollout
+from gpe_pl.scenes.scene import Scene
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests import scenes
@@ -80,6 +81,25 @@ def test_motion_of_the_scene_is_found_too(wanted: list[str]) -> None:
         assert [answer[f"velocity.{axis}"].estimate for axis in "xy"] == pytest.approx([1.0, 0.5], abs=0.05)
         assert answer.num_windows == 1
     assert answer["sand.friction_angle"].estimate == pytest.approx(ANGLE, abs=2.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["sand", "snow"])
+def test_the_initial_velocity_of_a_body_in_flight_is_that_at_the_start(name: str) -> None:
+    """Models read mean velocities of frames before the start, which differ from the sought one by half of what gravity changes in a frame."""
+    model = LearnedSimulator.from_checkpoint(name)
+    state, metadata = Scene(box=(1.0, 1.0)).block(name, at=(0.4, 0.6), size=(0.15, 0.15), velocity=(0.3, -0.7)).state(model)
+    seen = rollout(model, model.standing(state, metadata), 15, metadata)
+    sought = unknowns_of(seen, ["velocity"], {})
+    own = shooting(model, Observations.of(seen), sought, ShootingSettings(single_frames=15))
+
+    def misfit(vertical: float) -> float:
+        return own.misfit([(u.coordinate(v) - u.coordinate(u.low)) / u.range for u, v in zip(sought.items, (0.3, vertical), strict=True)])
+
+    assert misfit(-0.7) < math.log(1.1 * FLOOR)
+    assert misfit(-0.7) < min(misfit(-0.69), misfit(-0.71)) - 1
+    _, gradient = own.misfit_and_gradient([0.5, 0.5])
+    assert (gradient != 0).all()
 
 
 def test_a_search_that_was_cut_short_says_so() -> None:
@@ -410,6 +430,20 @@ def test_intervals_do_not_depend_on_the_truth_of_their_own_part() -> None:
     assert (before[::2] != after[::2]).any()
 
 
+def test_intervals_have_no_ends_if_true_values_lie_beyond_the_bounds() -> None:
+    known = [scene(20.0 + k, 1.0, 0.0) for k in range(15)] + [replace(scene(60.0, 1.0, 0.0), truth=70.0) for _ in range(5)]
+    found = calibrated(known)
+    assert found.threshold == math.inf
+    assert found.interval(known[0].estimate, known[0].profile)[1:] == (-math.inf, math.inf)
+
+
+def test_corrections_stay_within_what_is_possible() -> None:
+    ratio = Unknown("solid.poisson_ratio#2", "", "1", 0.1, 0.45, False, "parameter", 1, np.zeros(0, np.int64))
+    assert [ratio.possible(value) for value in (-math.inf, 0.3, 0.517)] == [0.0, 0.3, 0.49]
+    assert replace(ratio, high=0.5).possible(0.517) == 0.5  # the user's own bounds are wider
+    assert replace(ratio, name="velocity.x", kind="velocity").possible(-9.0) == -9.0
+
+
 def test_answers_are_read_as_they_were_written(tmp_path: Path) -> None:
     answer: Answer = identify_parameters(Drag(), thrown(), bounds=BOUNDS, scene="first")
     answer.write(tmp_path)
@@ -454,6 +488,18 @@ def test_a_calibration_of_another_search_is_refused(tmp_path: Path, there: dict[
     sealed.write(tmp_path / "config.json", {**_identity(cfg), **there})
     with pytest.raises(ConfigError, match=f"was made with other settings .{name}: "):
         _calibrations(cfg, settings)
+
+
+@pytest.mark.slow
+def test_a_calibration_with_true_values_beyond_the_bounds_is_refused(tmp_path: Path) -> None:
+    cfg = compose("identify", "checkpoint=sand", "trajectory=scenes", "simulator=solver", f"calibration={tmp_path}")
+    for k in range(10):
+        identify_parameters(Drag(), thrown(20.0 + 3 * k), bounds=BOUNDS, scene=f"scene{k}").write(tmp_path)  # the last two exceed 42.5
+    sealed.write(tmp_path / "config.json", _identity(cfg))
+    with pytest.raises(
+        ConfigError, match="sand.friction_angle by simulator=solver: too many calibration scenes have true values beyond the bounds"
+    ):
+        _calibrations(cfg, Settings("sand", "scenes", simulator="solver", calibration=str(tmp_path)))
 
 
 @pytest.mark.slow

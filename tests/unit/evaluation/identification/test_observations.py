@@ -46,6 +46,17 @@ def test_noise_is_smoothed_on_each_side_of_a_gap() -> None:
     assert len(starts) > 2 and all(flags[frame].all() for frame in starts)
 
 
+def test_scenes_have_hidden_nodes_and_noise_of_their_own() -> None:
+    settings = ObservationSettings(nodes=0.5, added_noise=1e-3)
+    first, second = (replace(thrown(angle), pos=thrown(angle).pos.astype(np.float64)) for angle in (25.0, 26.0))
+    a, again, b = (Observations.of(own, settings) for own in (first, first, second))
+    assert a.digest == again.digest
+    assert (a.seen != b.seen).any()
+    noise = [(own.trajectory.pos - true.pos).ravel() for own, true in ((a, first), (b, second))]
+    assert abs(np.corrcoef(noise)[0, 1]) < 0.1
+    np.testing.assert_allclose(np.std(noise, axis=1), 1e-3, rtol=0.1)
+
+
 def test_short_runs_of_frames_are_not_smoothed(caplog: pytest.LogCaptureFixture) -> None:
     seen = thrown()
     flags = np.ones(seen.pos.shape[:2], dtype=bool)
