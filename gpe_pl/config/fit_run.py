@@ -28,7 +28,7 @@ from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import every, open_split, window_counts
 from gpe_pl.data.sampling import BatchSize
-from gpe_pl.evaluation.metric_rows import LEARNED, means, read_rows
+from gpe_pl.evaluation.metric_rows import LEARNED, read_rows
 from gpe_pl.evaluation.rollouts import evaluate
 from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, claim, without_tables
@@ -40,6 +40,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.transfer import check_model, keep_rollout_settings, keep_trained_ranges
 from gpe_pl.models.lookup import model_class
 from gpe_pl.reports.finished_runs import Run, rollout_errors, table_of
+from gpe_pl.reports.outcome import means
 from gpe_pl.rollout.loop import Restartable
 from gpe_pl.system.progress import no_bar, progress_bar
 from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_time_key, within_budget
@@ -211,7 +212,7 @@ class FitRun:
         rows = evaluate(
             simulator, self.evaluated_root, self.evaluation, self.folder, controls=self.controls, stride=self.evaluated_stride, bars=bars
         )
-        publish(self._loggers, self.folder, means(rows))
+        publish(self._loggers, self.folder, means(Run(self.folder, {}, table_of(rows))))
 
     def error(self) -> float:
         """Return the mean full-length rollout MSE [m²] on the first evaluated split. Failed rollouts count as in ``finished_runs.rollout_errors``.

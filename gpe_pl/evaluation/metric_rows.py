@@ -10,8 +10,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
-
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.horizons import time_of
 from gpe_pl.files import regular_files
@@ -113,12 +111,3 @@ def read_rows(path: Path) -> Iterator[Row]:
 
 def _digest_file(path: Path) -> Path:
     return path.with_name(f"{path.name}.sha256")
-
-
-def means(rows: list[Row], label: str = LEARNED) -> dict[str, float]:
-    """Return the means of a model's metrics over trajectories, by ``split/metric@horizon``."""
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        if row.model == label:
-            values.setdefault(f"{row.split}/{row.metric}@{row.horizon}", []).append(row.value)
-    return {key: float(np.mean(v)) for key, v in values.items()}

@@ -98,7 +98,7 @@ def _error_lines(groups: Labelled) -> list[str]:
             lines.append(table_row(cells))
     note = (
         "Whole rollouts: mean over scenes with its 95 % bootstrap interval, and the ratio to the first model of the same split over the same scenes. A failed "
-        "rollout counts as ballistic flight in the same scene. Corrected: fraction of particle-steps that containment moves."
+        "rollout counts as ballistic flight in the same scene. Corrected: fraction of particle-steps that containment moves, up to where rollouts stopped."
     )
     starts = next((found for own in groups.values() if len(found := starts_of(own.values())) > 1), [])
     return [*lines, "", note, *(["", f"**{DIFFERENT_STARTS.format(', '.join(starts))}**"] if starts else [])]

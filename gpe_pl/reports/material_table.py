@@ -17,7 +17,7 @@ from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NE
 from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_ratio, median_of_means
-from gpe_pl.reports.finished_runs import Run, Values, rollout_errors, shared_table, shared_trajectories, values_by_seed
+from gpe_pl.reports.finished_runs import Run, Values, axes_of, rollout_errors, shared_table, shared_trajectories, values_by_seed
 from gpe_pl.reports.parameter_curves import axis_label
 from gpe_pl.viz.saving import save_figure
 
@@ -30,6 +30,8 @@ FEWEST_SCENES = 6
 WITHOUT = "none"
 """Value of ``model.material_embedding`` of models without the parameter."""
 EMBEDDING = "model.material_embedding"
+MAY_DIFFER = {EMBEDDING, "seed", "training.num_steps", "checkpoint"}
+"""Settings in which a model without the parameter may differ from the model that it is compared with."""
 
 FARTHER = ("middle", "shuffled")
 """Controls that differ from a scene's own parameters by more than the nearest trained ones."""
@@ -177,10 +179,9 @@ def _points(runs: Sequence[Run], label: str) -> dict[float, list[float]]:
 
 
 def _without(groups: Groups, domain: str, runs: Sequence[Run]) -> list[Run]:
-    """Return the runs of the same model in the same domain that were trained without the parameter."""
-    model = runs[0].config.get("model._target_")
-    others = [run for (d, _), members in groups.items() if d == domain for run in members if run.config.get("model._target_") == model]
-    return [run for run in others if run.config.get(EMBEDDING) == WITHOUT]
+    """Return the runs in the same domain that were trained without the parameter. Their other settings are those of ``runs``, seeds and steps excepted."""
+    others = [run for (d, _), members in groups.items() if d == domain for run in members if run.config.get(EMBEDDING) == WITHOUT]
+    return [run for run in others if {*axes_of([runs[0], run])} <= MAY_DIFFER]
 
 
 def _errors(runs: Sequence[Run], label: str, horizon: str = FULL) -> Values:

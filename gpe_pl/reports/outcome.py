@@ -1,4 +1,4 @@
-"""The outcome of an evaluation in one line per split: how far a model is below free flight, how many rollouts failed, and what else is wrong."""
+"""The outcome of an evaluation: mean metrics, and one line per split on how far a model is below free flight, what failed, and what else is wrong."""
 
 from __future__ import annotations
 
@@ -15,6 +15,24 @@ REMARKS = {
     "fraction_outside_at_end": (0.0, "{:.3g} % of the nodes end in walls"),
 }
 """Fractions that are mentioned above a limit, with the words for their percentage."""
+
+
+def means(run: Run) -> dict[str, float]:
+    """Return the means of a model's metrics over trajectories, by ``split/metric@horizon``, and the number of failed rollouts, by ``split/num_failed``.
+
+    A failed rollout has the error of ballistic flight, as in tables (``rollout_errors``).
+    """
+    rows = run.rows[run.rows["model"] == LEARNED]
+    found: dict[str, float] = {}
+    for (split, metric, horizon), values in rows.groupby(["split", "metric", "horizon"], sort=False)["value"]:
+        shown = values.to_list()
+        if metric == "rollout_mse":
+            (errors,) = rollout_errors([run], split, horizon)
+            shown = [*errors.values()]
+        if (metric, horizon) == ("rollout_mse", "full"):
+            found[f"{split}/num_failed"] = float(sum(not math.isfinite(value) for value in values))
+        found[f"{split}/{metric}@{horizon}"] = sum(shown) / len(shown)
+    return found
 
 
 def outcomes(run: Run) -> Iterator[str]:

@@ -59,6 +59,8 @@ def ratio_cell(runs: list[Run], reference: list[Run], split: str, horizon: str) 
 
 def ratio_text(own: np.ndarray, other: np.ndarray, statistic: Callable[..., Any]) -> str:
     """Return the ratio of a statistic of two tables of errors [seed, trajectory] with its interval; bold if it is significant."""
+    if all(np.isinf(statistic(table, axis=(-2, -1))) for table in (own, other)):
+        return "both failed"
     ratio = bootstrap_ratio(own, other, statistic=statistic)
     enough = min(len(own), len(other)) >= FEWEST_SEEDS and own.shape[1] >= FEWEST_SCENES
     estimate = f"**{ratio.estimate:.2f}**" if enough and (ratio.low > 1 or ratio.high < 1) else f"{ratio.estimate:.2f}"

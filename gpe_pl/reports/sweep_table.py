@@ -285,14 +285,16 @@ def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios
                     f"{ratios[key]:.2f}" if key in ratios else "–",
                     _interval(values_by_seed(runs, LEARNED, "test", "momentum_error", "full")),
                     _percent(values_by_seed(runs, LEARNED, "test", "fraction_outside_uncontained", "full")),
-                    _percent(values_by_seed(runs, LEARNED, "test", "fraction_corrected", "full")),
+                    _percent(values_by_seed(runs, LEARNED, "test", "fraction_corrected", "full"))
+                    + _failed(values_by_seed(runs, LEARNED, "test", "rollout_mse", "full")),
                 ]
             )
         )
     note = (
         "Validation loss: last value, mean over seeds (range). Forward time: trained models on one graph, by PyTorch's operations alone, "
         "median of paired ratios to the first row. "
-        "Outside: fraction of particle-frames inside a wall or obstacle when containment is off; corrected: fraction of particle-steps that containment moves."
+        "Outside: fraction of particle-frames inside a wall or obstacle when containment is off; corrected: fraction of particle-steps that containment moves, "
+        "up to where rollouts stopped."
     )
     return [*lines, *rows, "", note]
 
@@ -329,7 +331,7 @@ def _rollout_table(names: list[str], variants: dict[Variant, list[Run]]) -> list
     if "test_unseen" in splits:
         note += " `test_unseen` holds material parameters that training did not have, between the trained ones and outside their range."
     other_scenes = [f"{', '.join(key) or LEARNED}: {said}" for key, runs in variants.items() for said in scenes_left_out(runs, horizons)]
-    return [*lines, "", note, *(line for said in other_scenes for line in ("", f"**{said}**"))]
+    return [*lines, "", note, *(line for said in (*other_scenes, *unlike_scenes(variants)) for line in ("", f"**{said}**"))]
 
 
 def scenes_left_out(runs: list[Run], horizons: Iterable[str]) -> list[str]:
@@ -349,6 +351,19 @@ def scenes_left_out(runs: list[Run], horizons: Iterable[str]) -> list[str]:
             said.append(
                 f"of {len(scenes)} scenes of `{split}`, columns have only {', '.join(fewer)}, so columns with other scenes cannot be compared"
             )
+    return said
+
+
+def unlike_scenes(variants: Mapping[Variant, list[Run]]) -> list[str]:
+    """Say which variants of a data set have evaluated other scenes of a split than others, so that means over all scenes cannot be compared."""
+    said = []
+    for domain in dict.fromkeys(str(run.config["data.name"]) for runs in variants.values() for run in runs):
+        own = {key: runs for key, runs in variants.items() if str(runs[0].config["data.name"]) == domain}
+        for split in sorted({split for runs in own.values() for run in runs for split in splits_of(run) if "/" not in split}):
+            found = {key: shared_trajectories(values) for key, runs in own.items() if (values := rollout_errors(runs, split, "full"))}
+            if len({tuple(scenes) for scenes in found.values()}) > 1:
+                counts = ", ".join(f"{len(scenes)} ({', '.join(key) or LEARNED})" for key, scenes in found.items())
+                said.append(f"rows of {domain} have other scenes of `{split}`: {counts}; only ratios over the same scenes compare them")
     return said
 
 

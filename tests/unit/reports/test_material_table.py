@@ -15,7 +15,7 @@ from gpe_pl.files import sealed
 from gpe_pl.reports import sweep_table
 from gpe_pl.reports.domain_table import report_domains
 from gpe_pl.reports.finished_runs import Run, finished_runs
-from gpe_pl.reports.material_table import material_lines, reads_material, verdict
+from gpe_pl.reports.material_table import _errors, _mean, _without, material_lines, reads_material, verdict
 
 HARD = np.array([1.0, 2.0, 4.0, 8.0, 3.0, 5.0])
 """Errors of six scenes [1e-3 m²]; those with odd numbers are extrapolated in pairs, so their errors are not used."""
@@ -139,3 +139,17 @@ def test_short_horizons_have_ratios_of_their_own(tmp_path: Path) -> None:
 
 def cells_of(line: str) -> list[str]:
     return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_the_model_without_the_parameter_has_the_settings_of_the_model(tmp_path: Path) -> None:
+    """A sweep of another setting has a model without the parameter for each of its values."""
+    for history, factor in ((1, 1.0), (5, 10.0)):
+        for embedding in ("affine", "none"):
+            folder = tmp_path / str(history) / embedding
+            write_run(folder, embedding, 0, READS | {"own": factor * (0.9 if embedding == "affine" else 1.3)})
+            config = sealed.read(folder / "config.json", "")
+            sealed.write(folder / "config.json", {**config, "graph": {"history": history}})
+    groups = {("sand", run.folder.parent.name + run.folder.name): [run] for run in finished_runs(tmp_path)}
+    own = {key[1]: _mean(_errors(_without(groups, "sand", runs), LEARNED)) for key, runs in groups.items()}
+    first, second = (float(np.median(1.3e-3 * factor * HARD.mean())) for factor in (1.0, 10.0))
+    assert own == pytest.approx({"1affine": first, "1none": first, "5affine": second, "5none": second})

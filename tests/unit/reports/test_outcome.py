@@ -9,7 +9,7 @@ import pytest
 
 from gpe_pl.evaluation.metric_rows import Row
 from gpe_pl.reports.finished_runs import Run, table_of
-from gpe_pl.reports.outcome import outcomes
+from gpe_pl.reports.outcome import means, outcomes
 
 
 def run(learned: list[float], flight: list[float], **fractions: float) -> Run:
@@ -46,6 +46,12 @@ def run(learned: list[float], flight: list[float], **fractions: float) -> Run:
 )
 def test_a_split_has_a_line(made: Run, line: str) -> None:
     assert list(outcomes(made)) == [line]
+
+
+def test_means_count_failures_as_tables_do() -> None:
+    found = means(run([2.0, math.inf], [10.0, 14.0], fraction_corrected=0.25))
+    assert found == {"test/num_failed": 1.0, "test/rollout_mse@full": 8.0, "test/fraction_corrected@full": 0.25}
+    assert means(run([2.0, math.inf], []))["test/rollout_mse@full"] == math.inf
 
 
 def test_without_free_flight_there_is_no_line() -> None:

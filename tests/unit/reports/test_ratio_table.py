@@ -10,7 +10,7 @@ import pytest
 from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
 from gpe_pl.files import sealed
 from gpe_pl.reports.finished_runs import finished_runs
-from gpe_pl.reports.ratio_table import NOTE
+from gpe_pl.reports.ratio_table import NOTE, ratio_text
 from gpe_pl.reports.sweep_table import report_sweep
 
 NUM_SCENES = 8
@@ -43,6 +43,13 @@ def ratios(folder: Path) -> dict[str, str]:
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[len(lines) - lines[::-1].index("") :]]
     assert rows[0] == ["interaction", "split", "@full"]
     return {row[0]: row[-1] for row in rows[2:]}
+
+
+def test_a_ratio_of_two_failures_is_no_number() -> None:
+    failed, fine = np.array([[1e-3, np.inf]]), np.array([[1e-3, 2e-3]])
+    assert ratio_text(5 * failed, failed, np.mean) == "both failed"
+    assert ratio_text(fine, fine, np.mean).startswith("1.00 ")
+    assert ratio_text(failed, fine, np.mean).startswith("inf ")
 
 
 def test_scenes_are_paired(tmp_path: Path) -> None:

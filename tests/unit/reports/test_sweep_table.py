@@ -69,6 +69,30 @@ def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path)
 
 
 @pytest.mark.slow
+def test_variants_of_other_scenes_are_named(runs: Path) -> None:
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    assert "rows of sand have other scenes" not in (runs / "table.md").read_text()
+    path = runs / "odd" / "0" / "metrics.csv"
+    write_rows(path, [row for row in read_rows(path) if row.trajectory == 0])
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    (line,) = (line for line in (runs / "table.md").read_text().splitlines() if "have other scenes" in line)
+    assert line.startswith(
+        "**rows of sand have other scenes of `test_unseen`: 2 (directed), 2 (negated), 1 (odd), 2 (odd_even); only ratios"
+    )
+
+
+@pytest.mark.slow
+def test_failed_rollouts_are_named_beside_what_was_corrected(runs: Path) -> None:
+    """Frames after a rollout stopped were not corrected, because there are none."""
+    for interaction in ("negated", "directed"):
+        path = runs / interaction / "0" / "metrics.csv"
+        rows = [replace(row, split="test", parameter_group="") for row in read_rows(path)]
+        write_rows(path, [*rows, Row(LEARNED, "test", 0, "", 20.0, "fraction_corrected", "full", 0.0)])
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    assert [cells(runs, name)[0][-1] for name in ("negated", "directed")] == ["0.000 %", "0.000 %, 1 of 2 failed"]
+
+
+@pytest.mark.slow
 def test_seeds_of_other_scenes_are_compared_in_those_that_all_have(runs: Path) -> None:
     path = runs / "negated" / "1" / "metrics.csv"
     write_rows(path, [row for row in read_rows(path) if row.trajectory == 0])
