@@ -139,6 +139,12 @@ def test_momentum_ablation_shows_all_interactions(executed: Callable[[Path], Any
         assert all(f">{interaction}<" in table for table in tables)
 
 
+@pytest.mark.notebook
+def test_unseen_materials_clamps_parameters_as_the_evaluation_of_its_runs_did(executed: Callable[[Path], Any]) -> None:
+    said = "The model gets the nearest trained value outside the trained range, as in its evaluation."
+    assert any(said in output.get("text", "") for output in _outputs(executed(ROOT / "notebooks" / "unseen_materials.ipynb")))
+
+
 def _run_first_code(path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Execute the first cell of code in this process, without the commands of IPython. A kernel would import everything again."""
     monkeypatch.setenv("GPE_RUNS", str(runs))
