@@ -36,7 +36,7 @@ def table(folders: list[Path]) -> str:
                 "data set",
                 *(axis.rpartition(".")[2] for axis in axes),
                 "seeds",
-                *(f"{s}, {part}" for s in SPLITS for part in ("a quarter", "whole")),
+                *(f"{s}, {part}" for s in SPLITS for part in ("first quarter", "whole")),
             ]
             lines += [table_row(header), "|" + "---|" * len(header)]
         if axes != of_all:
