@@ -15,7 +15,7 @@ class Mirrored:
     """Mirrors a state at a plane, makes the step, and mirrors the result back.
 
     A rollout equals that of the inner simulator if that simulator is mirror-symmetric. The image of a boundary has no shapes if one of them has no image
-    (``geometry.reflected_shapes``). The inner simulator then has to read boundary nodes, as learned simulators do. Containment goes
+    (``geometry.shape_images``). The inner simulator then has to read boundary nodes, as learned simulators do. Containment goes
     outside: ``Contained(Mirrored(simulator, …), dt)``.
 
     Attributes:

@@ -11,7 +11,8 @@ from typing import Any, Protocol
 import numpy as np
 from array_api_compat import array_namespace, device
 
-from gpe_pl.geometry.reflected_shapes import reflected
+from gpe_pl.geometry.shape_images import image_of
+from gpe_pl.geometry.shapes import Shape
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State, Stress
@@ -59,7 +60,7 @@ class Isometry(Protocol):
         """Return the images of stresses [..., component], in the order of ``schema.STRESS_COMPONENTS``."""
 
     def boundary(self, boundary: Boundary) -> Boundary:
-        """Return the image of a boundary; it has nodes and no shapes."""
+        """Return the image of a boundary. It has shapes if all of its shapes have images."""
         motion = boundary.motion
         if motion is not None:
             motion = BoundaryMotion(self.point(motion.pos), self.vector(motion.vel), self.vector(motion.normal))
@@ -68,9 +69,12 @@ class Isometry(Protocol):
             pos=self.point(boundary.pos),
             vel=self.vector(boundary.vel),
             normal=self.vector(boundary.normal),
-            shapes=(),
+            shapes=self.shapes(boundary.shapes),
             motion=motion,
         )
+
+    def shapes(self, shapes: Sequence[Shape]) -> tuple[Shape, ...]:
+        """Return the images of all walls and obstacles (``image_of``), or none if one of them has no image."""
 
     def openings(self, openings: tuple[Opening, ...]) -> tuple[Opening, ...]:
         """Return the images of inlets and outlets.
@@ -146,11 +150,9 @@ class Reflection(Isometry):
         """Return the images of positions [..., dim] in m."""
         return self.vector(x) + _row([0.0 if plane is None else 2 * plane for plane in self.planes], x)
 
-    def boundary(self, boundary: Boundary) -> Boundary:
-        """Return the image of a boundary. It has shapes if all of its shapes have images (``reflected_shapes``)."""
-        image = super().boundary(boundary)
-        shapes = [reflected(shape, self.planes) for shape in boundary.shapes]
-        return image if None in shapes else replace(image, shapes=tuple(shape for shape in shapes if shape is not None))
+    def shapes(self, shapes: Sequence[Shape]) -> tuple[Shape, ...]:
+        """Return the images of all walls and obstacles, or none if one of them has no image."""
+        return _images(shapes, np.diag(self.vector(np.ones(len(self.planes)))), self.point(np.zeros(len(self.planes))))
 
     def openings(self, openings: tuple[Opening, ...]) -> tuple[Opening, ...]:
         """Return the images of inlets and outlets, with their sides."""
@@ -209,6 +211,12 @@ class Rotation(Isometry):
         """Return the images of positions [..., dim] in m."""
         return ((x - self.centre) @ self.matrix.T + self.centre).astype(x.dtype)
 
+    def shapes(self, shapes: Sequence[Shape]) -> tuple[Shape, ...]:
+        """Return the images of all walls and obstacles; none if one of them has no image, or axes are not mapped onto axes."""
+        matrix = np.round(self.matrix)
+        is_quarter_turn = np.abs(self.matrix - matrix).max() < LEVEL
+        return _images(shapes, matrix, self.centre - matrix @ self.centre) if is_quarter_turn else ()
+
     def tensor(self, x: Array) -> Array:
         """Return the images of stresses [..., component], in the order of ``schema.STRESS_COMPONENTS``."""
         dim = len(self.centre)
@@ -216,6 +224,12 @@ class Rotation(Isometry):
         turned = self.matrix @ x[..., places].reshape(*x.shape[:-1], dim, dim) @ self.matrix.T
         in_plane = turned.reshape(*x.shape[:-1], dim**2)[..., rows]
         return np.concatenate([in_plane, x[..., len(rows) :]], axis=-1).astype(x.dtype)
+
+
+def _images(shapes: Sequence[Shape], matrix: np.ndarray, shift: np.ndarray) -> tuple[Shape, ...]:
+    """Return the images of all shapes (``image_of``), or none if one of them has no image."""
+    images = [image_of(shape, matrix, shift) for shape in shapes]
+    return () if None in images else tuple(image for image in images if image is not None)
 
 
 @cache

@@ -127,6 +127,22 @@ def test_every_direction_of_gravity_is_drawn_alike() -> None:
     assert len(counts) == 4 and min(counts.values()) > 70
 
 
+def test_windows_of_the_elastic_law_are_not_turned_by_any_angle(truth: Trajectory) -> None:
+    stored = StoredTrajectory(Path("shard"), "0", truth.num_frames, truth.num_nodes, truth)
+    builder = GraphBuilder(GraphConfig(history=HISTORY), truth.metadata)
+    builder = replace(builder, config=replace(builder.config, cells=True))
+    with pytest.raises(AugmentationError, match=r"training.rotate=true: the elastic law reads the shapes of walls"):
+        WindowDataset([stored], builder, augmentation=Augmentation(rotate=True))
+
+
+@pytest.mark.parametrize("number", range(1, 24))
+def test_a_quarter_turn_keeps_the_shapes_of_walls(truth: Trajectory, number: int) -> None:
+    image = turned_with_gravity(truth, number).boundary
+    assert len(image.shapes) == 6
+    distance = np.min([np.abs(shape.signed_distance(image.pos)) for shape in image.shapes], axis=0)
+    assert distance.max() < 1e-6
+
+
 def test_a_stress_in_the_plane_turns_with_it() -> None:
     turn, stress = Rotation.between_axes(1, (0.0, 0.0)), np.array([1.0, 2.0, 3.0, 4.0])
     full = turn.matrix @ np.array([[1.0, 2.0], [2.0, 3.0]]) @ turn.matrix.T

@@ -1,4 +1,4 @@
-"""Mirror images of walls and obstacles."""
+"""Images of walls and obstacles under maps of space that map axes onto axes: mirror images and quarter turns."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ import numpy as np
 from gpe_pl.geometry.shapes import Bowl, Box, Polygon, Shape, Sphere, Wall
 
 
-def reflected(shape: Shape, planes: Sequence[float | None]) -> Shape | None:
-    """Return the mirror image of a wall or obstacle; None for kinds that have none, such as grids of distances.
+def image_of(shape: Shape, matrix: np.ndarray, shift: np.ndarray) -> Shape | None:
+    """Return the image of a wall or obstacle under ``x → matrix @ x + shift``; None for kinds that have none, such as grids of distances.
 
     Args:
         shape: wall or obstacle.
-        planes: position of the plane normal to each axis [m]; None for axes that stay.
+        matrix: permutation of the axes with signs [dim, dim].
+        shift: displacement [dim] in m.
     """
-    sign = np.array([1.0 if plane is None else -1.0 for plane in planes])
-    shift = np.array([0.0 if plane is None else 2 * plane for plane in planes])
 
     def images(points: Any) -> np.ndarray:
-        return np.asarray(points, np.float64) * sign + shift
+        return np.asarray(points, np.float64) @ matrix.T + shift
 
     def between(low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
         ends = np.sort(images([low, high]), axis=0)
@@ -34,8 +33,8 @@ def reflected(shape: Shape, planes: Sequence[float | None]) -> Shape | None:
         return replace(shape, **between(shape.low, shape.high))
     if isinstance(shape, Polygon):
         vertices = images(shape.vertices)
-        return replace(shape, vertices=tuple(map(tuple, (vertices if sign.prod() > 0 else vertices[::-1]).tolist())))
+        return replace(shape, vertices=tuple(map(tuple, (vertices if np.linalg.det(matrix) > 0 else vertices[::-1]).tolist())))
     if isinstance(shape, Wall):
-        normal = np.asarray(shape.normal, np.float64) * sign
+        normal = matrix @ np.asarray(shape.normal, np.float64)
         return replace(shape, normal=tuple(normal.tolist()), offset=float(shape.offset + normal @ shift), **between(shape.low, shape.high))
     return None
