@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import shapely
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.meshing import MeshingError, triangulate
@@ -14,12 +16,22 @@ from gpe_pl.geometry.shapes import Polygon
 from gpe_pl.solvers.scenes import JITTER, MESHED, lattice_cells
 from gpe_pl.solvers.solid_scenes import lumped_masses
 
+log = logging.getLogger(__name__)
+
 NUM_SIDES = 48
 """Number of corners of the outline of a disc of a meshed solid."""
 MOST_NODES = 500_000
 """Largest number of nodes of a body."""
 DARK = 0.5
 """Brightness below which a pixel of an image belongs to the body, from 0 to 1."""
+MASS_TOLERANCE = 0.1
+"""Fraction by which the mass of the nodes may differ from that of the body without a warning."""
+MOST_SMALL = 2_000
+"""Number of nodes above which the masses are not compared, because the difference is small then."""
+MOST_LOOSE = 0.25
+"""Largest fraction of the nodes of an elastic body that may be in no cell."""
+Region = Callable[[np.ndarray], np.ndarray]
+"""Tells which of points [point, dim] are inside."""
 
 
 class BodyFault(GpeError, ValueError):
@@ -45,7 +57,7 @@ class Body:
     material: str
     low: np.ndarray
     high: np.ndarray
-    contains: Callable[[np.ndarray], np.ndarray]
+    contains: Region
     outline: np.ndarray | None
     velocity: np.ndarray
     parameters: Mapping[str, float]
@@ -87,8 +99,54 @@ def discretised(body: Body, spacing: float, density: float, rng: np.random.Gener
         raise BodyFault(f"{body.name}: has no node, as nodes are {spacing:g} m apart; make it larger")
     is_meshed = body.material in MESHED
     cells = lattice_cells(sites[inside]) if is_meshed else np.empty((0, dim + 1), dtype=np.int64)
+    num_loose = int(inside.sum()) - len(np.unique(cells))
+    if is_meshed and num_loose > MOST_LOOSE * inside.sum():
+        raise BodyFault(
+            f"{body.name}: {num_loose} of its {int(inside.sum())} nodes are in no cell, so that it would fall to pieces; make it at least two distances of "
+            f"nodes thick, {2 * spacing:g} m"
+        )
     pos = centre[inside] + (0.0 if is_meshed else distance * rng.uniform(-JITTER, JITTER, (int(inside.sum()), dim)))
-    return Nodes(pos, np.full(len(pos), density * distance.prod()), cells)
+    nodes = Nodes(pos, np.full(len(pos), density * distance.prod()), cells)
+    _warn_of_mass(body, nodes, density, spacing)
+    return nodes
+
+
+def overlap(one: Region, other: Region, pos: np.ndarray, spacing: float) -> bool:
+    """Whether two regions overlap by about half a spacing [m] or more in every direction, near the nodes of the first at ``pos`` [node, dim] in m.
+
+    Thinner overlaps are those of outlines that touch. Nodes alone do not tell, because the lattices of two bodies can interleave.
+    """
+    dim = pos.shape[1]
+    corners = np.stack(np.meshgrid(*[(-0.25, 0.25)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    points = (pos[:, None] + spacing * corners).reshape(-1, dim)
+    points = points[other(points)]
+    for step in 0.24 * spacing * np.concatenate([np.zeros((1, dim)), np.eye(dim), -np.eye(dim)]):
+        points = points[one(points + step) & other(points + step)]
+    return bool(len(points))
+
+
+def _warn_of_mass(body: Body, nodes: Nodes, density: float, spacing: float) -> None:
+    """Warn if the nodes of a small or thin body have another mass than the body."""
+    if len(nodes.pos) > MOST_SMALL:
+        return
+    ratio = float(nodes.mass.sum()) / (density * _volume(body, spacing))
+    if abs(ratio - 1) > MASS_TOLERANCE:
+        log.warning(
+            "%s: its nodes have %.2f times its mass, because few nodes %g m apart fit into it; make it larger or thicker",
+            body.name,
+            ratio,
+            spacing,
+        )
+
+
+def _volume(body: Body, spacing: float) -> float:
+    """Return the volume of a body [m³], or its area in 2D [m²]: that of its outline, or of the sites of a lattice with four sites in a spacing [m]."""
+    if body.outline is not None:
+        return float(shapely.Polygon(body.outline).area)
+    count = np.maximum(4, np.ceil(4 * (body.high - body.low) / spacing)).astype(int)
+    sites = np.stack(np.meshgrid(*[(np.arange(n) + 0.5) / n for n in count], indexing="ij"), axis=-1).reshape(-1, len(count))
+    inside = body.contains(body.low + (body.high - body.low) * sites)
+    return max(1, int(inside.sum())) / len(sites) * float(np.prod(body.high - body.low))
 
 
 def _meshed(body: Body, spacing: float, density: float, rng: np.random.Generator) -> Nodes:
@@ -98,7 +156,9 @@ def _meshed(body: Body, spacing: float, density: float, rng: np.random.Generator
         pos, cells = triangulate([body.outline], spacing, rng)
     except MeshingError as error:
         raise BodyFault(f"{body.name}: {error}") from None
-    return Nodes(pos, lumped_masses(pos, cells, density), cells)
+    nodes = Nodes(pos, lumped_masses(pos, cells, density), cells)
+    _warn_of_mass(body, nodes, density, spacing)
+    return nodes
 
 
 def block(low: np.ndarray, high: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray | None]:

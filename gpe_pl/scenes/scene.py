@@ -31,11 +31,12 @@ from gpe_pl.geometry.terrain import Up
 from gpe_pl.learned.pretrained import model_name, names
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.scenes import bodies as region
-from gpe_pl.scenes.bodies import Body, BodyFault, Nodes, discretised
+from gpe_pl.scenes.bodies import Body, BodyFault, Nodes, discretised, overlap
 from gpe_pl.scenes.film import Film
 from gpe_pl.scenes.obstacles import FRICTION, MeshObstacle
 from gpe_pl.scenes.recorded import NotRecorded, recorded_solver, settings
 from gpe_pl.scenes.rollouts import middle_values, predicted, solved
+from gpe_pl.scenes.united_obstacles import united
 from gpe_pl.scenes.zones import AT_ONCE, Zone, is_number, nodes_of, opening_of, speed_of
 from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.solvers.materials import limits_fault
@@ -332,7 +333,7 @@ class Scene:
             raise SceneFault(faults, self)
         self._warn_of_pushes(found, simulator)
         metadata = replace(own, dataset="scene", bounds=self.box, gravity=self.gravity, split="", seed=self.seed)
-        state = self._joined(found, values, shapes, own)
+        state = self._joined(found, values, united(shapes, own.spacing), own)
         return state.opened([opening for _, opening in openings]) if openings else state, metadata
 
     # --- details ---------------------------------------------------------------------------------------------------------------------------
@@ -523,6 +524,7 @@ class Scene:
     def _check_contacts(self, found: Mapping[str, Nodes], shapes: Mapping[str, Shape], spacing: float, faults: dict[str, str]) -> None:
         """Find nodes in obstacles, obstacles in meshes, and bodies that overlap."""
         trees: dict[str, cKDTree] = {}
+        regions = {body.name: body.contains for body in self.filled}
         for name, nodes in found.items():
             for obstacle, shape in shapes.items():
                 depth = -signed_distance((shape,), nodes.pos)
@@ -532,7 +534,7 @@ class Scene:
                     faults[name] = f"{obstacle} passes through it between its nodes; move one of the two"
             for other, tree in trees.items():
                 distance, _ = tree.query(nodes.pos)
-                if distance.min() < CLOSEST * spacing:
+                if distance.min() < CLOSEST * spacing or overlap(regions[name], regions[other], nodes.pos, spacing):
                     faults[name] = f"overlaps {other}; move one of the two"
             trees[name] = cKDTree(nodes.pos)
 
@@ -548,9 +550,7 @@ class Scene:
                 text = "%s and %s are %.2g m apart; the model pushes bodies apart that are nearer than %.2g m, which the solver does not"
                 log.warning(text, one.name, other.name, gap, reach)
 
-    def _joined(
-        self, found: Mapping[str, Nodes], values: Mapping[str, dict[str, float]], shapes: Mapping[str, Shape], own: Metadata
-    ) -> State:
+    def _joined(self, found: Mapping[str, Nodes], values: Mapping[str, dict[str, float]], shapes: Sequence[Shape], own: Metadata) -> State:
         pos = np.concatenate([nodes.pos for nodes in found.values()])
         params, first, cells = np.full((len(pos), len(own.param_names)), np.nan), 0, []
         vel, node_type = np.empty_like(pos), np.empty(len(pos), np.uint8)
@@ -572,7 +572,7 @@ class Scene:
             node_type=node_type,
             mass=np.concatenate([nodes.mass for nodes in found.values()]),
             material_params=params,
-            boundary=Boundary.sample((*walls, *shapes.values()), own.spacing, self.dim),
+            boundary=Boundary.sample((*walls, *shapes), own.spacing, self.dim),
             gravity=np.array(self.gravity),
             rest_pos=pos.copy() if has_mesh else None,
             cells=joined if has_mesh else None,

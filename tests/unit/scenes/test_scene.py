@@ -34,6 +34,13 @@ ROOT = Path(__file__).parents[3]
 SPACING = 0.015625  # of the shipped model of sand
 
 
+def bar(material: str, thickness: float) -> Scene:
+    """Return an oblique bar, 0.4 m long, whose thickness is given in spacings of the model of sand."""
+    along, across = 0.4 * np.sqrt(0.5) * np.array([1.0, 1.0]), thickness * SPACING * np.sqrt(0.5) * np.array([-1.0, 1.0])
+    corners = 0.3 + np.array([[0.0, 0.0], along, along + across, across])
+    return Scene(box=(1.0, 1.0)).polygon(material, corners.tolist())
+
+
 @cache
 def model(name: str) -> LearnedSimulator:
     return LearnedSimulator.from_checkpoint(name)
@@ -222,11 +229,37 @@ FAULTS: list[tuple[Callable[[], Any], str]] = [
     (lambda: column().block("sand", (0.9, 0.5), (0.3, 0.1)).predict(), "block 2 (sand): at, size: reaches from 0.9 to 1.2 m along x, the box from 0 to 1 m"),
     (lambda: column().block("sand", (0.5, 0.5), (0.01, 0.3)).predict(), "block 2 (sand): is 0.01 m thin, less than the distance of nodes, 0.015625 m"),
     (lambda: column().block("sand", (0.15, 0.1), (0.3, 0.3)).predict(), "block 2 (sand): overlaps block 1 (sand); move one of the two"),
+    (lambda: bar("elastomer", 1.0).predict(), "polygon 1 (elastomer): 19 of its 19 nodes are in no cell"),
     (lambda: column().obstacle(Circle((0.2, 0.1), 0.05)).predict(), "block 1 (sand): 27 of its 128 nodes are inside obstacle 1; move one of the two"),
     (lambda: plate_through_a_solid().predict(), "block 1 (solid): obstacle 1 passes through it between its nodes"),
     (lambda: column().obstacle(Circle((3.0, 0.5), 0.1)).predict(), "obstacle 1: no part of its surface is in the box; move it, or leave it out"),
     (lambda: column().obstacle(Box((0.5, 0.0, 0.0), (0.6, 0.1, 0.1), 0.4)).predict(), "obstacle 1: low must have 2 components"),
 ]  # fmt: skip
+
+
+@pytest.mark.parametrize("material", ["sand", "elastomer"])
+def test_bodies_whose_lattices_interleave_overlap(material: str) -> None:
+    """Their nodes are up to 0.71 spacings apart."""
+    spacing = model(material).builder.metadata.spacing
+    side, shift = 10 * spacing, np.random.default_rng(0).uniform(-8, 8, (20, 2)) * spacing
+    for way in shift:
+        scene = Scene(box=(1.0, 1.0)).block(material, (0.4, 0.4), (side, side)).block(material, tuple(0.4 + way), (side, side))
+        with pytest.raises(SceneFault, match="overlaps block 1"):
+            scene.state(model(material))
+    touching = Scene(box=(1.0, 1.0)).block(material, (0.4, 0.4), (side, side)).block(material, (0.4 + side, 0.4), (side, side))
+    assert touching.state(model(material))[0].num_nodes == 200
+
+
+@pytest.mark.parametrize(("thickness", "ratio"), [(1.0, "0.7"), (0.5, "1.4"), (12.0, "")])
+def test_a_body_whose_nodes_have_another_mass_is_named(thickness: float, ratio: str, caplog: pytest.LogCaptureFixture) -> None:
+    state, _ = bar("sand", thickness).state(model("sand"))
+    true = 1600 * 0.4 * thickness * SPACING
+    if ratio:
+        assert f"polygon 1 (sand): its nodes have {ratio}" in caplog.text
+        assert abs(state.mass.sum() / true - float(ratio)) < 0.1
+    else:
+        assert "its nodes have" not in caplog.text
+        assert state.mass.sum() == pytest.approx(true, rel=0.1)
 
 
 @pytest.mark.slow
