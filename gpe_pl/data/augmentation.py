@@ -129,15 +129,27 @@ class Augmentation:
         return trajectory
 
     def extremes(self, trajectory: Trajectory) -> list[Trajectory]:
-        """Return a trajectory and its images that widen the range of scenes in training: with the fastest walls, and with all directions of gravity."""
+        """Return a trajectory and its images that widen the range of scenes in training: with the fastest and slowest walls that ``moved`` reaches without
+        turning the scene, and with all directions of gravity.
+        """
         images = [trajectory]
         if self.boost_speed > 0:
-            velocity = np.zeros(trajectory.metadata.dim)
-            velocity[_level(trajectory)] = self.boost_speed
-            images.append(boosted(trajectory, velocity, 0))
+            images += [boosted(trajectory, velocity, 0) for velocity in self._extreme_boosts(trajectory)]
         if self.quarter_turns:
             images = [turned_with_gravity(image, number) for image in images for number in range(NUM_TURNS[trajectory.metadata.dim])]
         return images
+
+    def _extreme_boosts(self, trajectory: Trajectory) -> list[np.ndarray]:
+        """Return the velocities [dim] that give some boundary node at some frame the highest and the lowest speed; none without boundary nodes."""
+        boundary, level = trajectory.boundary, _level(trajectory)
+        own = (boundary.vel if boundary.motion is None else boundary.motion.vel).reshape(-1, trajectory.metadata.dim).astype(np.float64)
+        if not len(own):
+            return []
+        faster, slower = np.zeros((2, *own.shape))
+        faster[:, level] = np.where(own < 0, -self.boost_speed, self.boost_speed)[:, level]
+        slower[:, level] = -own.clip(-self.boost_speed, self.boost_speed)[:, level]
+        speeds = [np.linalg.norm(own + added, axis=1) for added in (faster, slower)]
+        return [faster[speeds[0].argmax()], slower[speeds[1].argmin()]]
 
 
 def turned_with_gravity(trajectory: Trajectory, number: int) -> Trajectory:

@@ -208,6 +208,30 @@ def test_without_gravity_and_with_walls_on_both_sides_or_none_all_axes_are_level
     assert images(beside_a_wall).any(axis=0).tolist() == [True, True, False]
 
 
+@pytest.mark.parametrize("own", [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.5, -2.0, 0.3), (0.0, 0.0, 0.0)])
+def test_extremes_have_the_fastest_and_slowest_walls_of_windows(truth: Trajectory, own: tuple[float, float, float]) -> None:
+    """Whatever the direction in which the walls of the scene move."""
+    moving = boosted(truth, np.array(own), 0)
+    augmentation = Augmentation(boost_speed=1.0)
+
+    def speeds(scene: Trajectory) -> np.ndarray:
+        motion = scene.boundary.motion
+        return np.linalg.norm(scene.boundary.vel if motion is None else motion.vel, axis=-1)
+
+    known = np.concatenate([speeds(image) for image in augmentation.extremes(moving)])
+    drawn = np.concatenate([speeds(augmentation.moved(moving, 4, 0, sample)) for sample in range(100)])
+    assert known.min() <= drawn.min() and drawn.max() <= known.max()
+    level, vertical = np.abs(own[:2]), own[2]
+    np.testing.assert_allclose(known.max(), np.hypot(np.linalg.norm(level + 1.0), vertical), rtol=1e-6)
+    np.testing.assert_allclose(known.min(), np.hypot(np.linalg.norm((level - 1.0).clip(0.0)), vertical), rtol=1e-6, atol=1e-6)
+
+
+def test_extremes_of_a_scene_without_walls_are_the_scene(truth: Trajectory) -> None:
+    open_space = with_walls(truth)
+    (image,) = Augmentation(boost_speed=1.0).extremes(open_space)
+    assert image is open_space
+
+
 @pytest.mark.parametrize("sides", [(), ("x_low", "x_high", "y_low", "y_high", "z_low", "z_high")])
 @pytest.mark.parametrize("pull", [0.0, -9.81])
 def test_gravity_that_is_not_stored_is_noticed(
