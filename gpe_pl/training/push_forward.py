@@ -18,6 +18,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.data.training_samples import UnrollStart, training_batch
 from gpe_pl.graphs.topology import Topology
 from gpe_pl.learned.differentiable import Differentiable
+from gpe_pl.learned.least_distance import kept_apart
 from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.base import Prediction
@@ -132,7 +133,7 @@ class Excursions:
 
     @torch.no_grad()
     def move_on(self, simulator: LearnedSimulator, lane: int, predicted: Prediction) -> None:
-        """Advance a lane's unrolls by one step.
+        """Advance a lane's unrolls by one step, as a rollout does: liquid nodes keep the least distance of the simulator.
 
         Args:
             simulator: integrates the accelerations.
@@ -142,6 +143,8 @@ class Excursions:
         under_way = self._lanes[lane]
         located = _located(simulator, under_way.scale)
         later = located.later(under_way.states, under_way.rows, predicted.to(under_way.states[0].pos.device))
+        if located.least_distance and located.training:  # in evaluation mode, later has done it
+            later = [kept_apart(state, located.least_distance, located.frame_dt) for state in later]
         pairs = zip(under_way.states, later, strict=True)
         under_way.states = [through_openings(state, after) if after.openings else after for state, after in pairs]
         under_way.steps = [step + 1 for step in under_way.steps]

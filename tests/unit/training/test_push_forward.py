@@ -23,9 +23,11 @@ from gpe_pl.graphs.topology import Topology
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.schema import node_code
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.push_forward import unrolled
 from gpe_pl.training.run import TrainingSettings
+from gpe_pl.trajectory.arrays import nearest_distances
 from gpe_pl.trajectory.boundary import BoundaryMotion
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import write_shard
@@ -88,6 +90,29 @@ def test_steps_of_training_move_the_states_on(data: WindowDataset, simulator: Le
             expected = [start.graph(data.builder, state, step) for start, state in zip(turn[step], states, strict=True)]
             assert_equal_graphs(graph, batched(expected), rtol=1e-4, atol=1e-4)
             module.loss(turn[step])
+
+
+def test_liquid_nodes_keep_their_distance_in_steps_of_training_as_in_rollouts(
+    new_trajectory: Callable[..., Trajectory], tmp_path: Path
+) -> None:
+    truth = new_trajectory(materials=("fluid",), param_names=("kinematic_viscosity",))
+    truth = replace(
+        truth, node_type=np.full_like(truth.node_type, node_code("fluid")), material_params=np.full_like(truth.material_params, 0.1)
+    )
+    write_shard(tmp_path / "train" / "shard-00000.h5", [truth])
+    stored = open_split(tmp_path, "train")
+    data = WindowDataset(stored, GraphBuilder(GraphConfig(history=2), truth.metadata))
+    torch.manual_seed(0)
+    simulator = LearnedSimulator(GPE(data.builder.spec, num_message_passing_steps=1, hidden_channels=8), data.builder)
+    simulator.least_distance = 0.1
+    module = TrainingModule(simulator, num_steps=10).train()
+    for step in range(3):
+        module.loss([data[StartKey(0, 0, step)]])
+    (moved,), expected = module._excursions._lanes[0].states, data[StartKey(0, 0, 0)].state
+    for _ in range(3):
+        expected = simulator.eval().step(expected)
+    torch.testing.assert_close(moved.pos, expected.pos, rtol=0, atol=1e-5)
+    assert nearest_distances(moved.pos.numpy(), moved.periodicity).min() > 0.07  # without it, nodes come as near as 0.066
 
 
 def test_at_the_end_of_the_truth_and_after_falling_apart_a_sample_is_at_its_start_again(
