@@ -79,7 +79,8 @@ class GraphStandardizer(nn.Module):
         source, name, target = relation
         return f"{role(source)}__{name}__{role(target)}"
 
-    def _is_log(self, material: str) -> list[bool]:
+    def is_log(self, material: str) -> list[bool]:
+        """Return for each parameter of a material whether its logarithm is standardised."""
         return [self.parameter_scale is None and p.scale == "log" for p in self.spec.parameters[material]]
 
     def _precision(self, material: str) -> torch.dtype:
@@ -87,11 +88,11 @@ class GraphStandardizer(nn.Module):
 
         Logarithms need double precision. In another unit they are shifted, and single precision would round them differently.
         """
-        return torch.float64 if any(self._is_log(material)) else torch.float32
+        return torch.float64 if any(self.is_log(material)) else torch.float32
 
     def _material_scale(self, material: str, params: Tensor) -> Tensor:
         """Return parameters [node, param], the logarithm of those with a logarithmic scale."""
-        is_log = self._is_log(material)
+        is_log = self.is_log(material)
         if not any(is_log):
             return params
         columns = params.to(torch.float64).unbind(dim=1)
@@ -164,7 +165,7 @@ class GraphStandardizer(nn.Module):
             node={t: statistics(self.node[role(t)]) for t in self.spec.node_types},
             odd={r: statistics(self.odd[key])[1] for r, key in keys.items()},
             even={r: statistics(self.even[key]) for r, key in keys.items()},
-            params={m: ParameterStandards(statistics(self.params[m]), self._is_log(m), bounds[m]) for m in self.spec.materials},
+            params={m: ParameterStandards(statistics(self.params[m]), self.is_log(m), bounds[m]) for m in self.spec.materials},
             mass=float(self.mass),
             precision=self.mass.detach().numpy().dtype,
         )

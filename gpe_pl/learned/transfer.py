@@ -2,7 +2,7 @@
 
 Weights and statistics are matched by name. A material that the trained simulator does not know takes those of a known one (``source_materials``). A tensor fits
 if it has the same shape. Weights that read material parameters are matched by the names of the parameters. Those of other parameters become zero, so that
-predictions do not depend on them at first.
+predictions do not depend on them at first. Models whose weights have places instead of names (``Model.has_named_weights``) start on the same layout only.
 
 Statistics are copied if both simulators have the same dimension, frame interval and spacing. Otherwise the new ones are kept, because motion in units of its
 statistics is alike at all scales.
@@ -19,10 +19,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
+from gpe_pl.graphs.standardizer import named
 from gpe_pl.learned.checkpoint_file import CheckpointError
+from gpe_pl.learned.training_ranges import have_same_scales
 from gpe_pl.nn.blocks import Standardize
-from gpe_pl.schema import MESH_MATERIALS
+from gpe_pl.schema import MESH_MATERIALS, FeatureSpec, role
 from gpe_pl.trajectory.scene_ranges import united
+from gpe_pl.trajectory.trajectory import Metadata
 
 if TYPE_CHECKING:
     from gpe_pl.learned.simulator import LearnedSimulator
@@ -56,13 +59,18 @@ class Transfer:
 
 
 def check_model(new: LearnedSimulator, trained: LearnedSimulator) -> None:
-    """Raise an error if the networks have other settings.
+    """Raise an error if weights of the trained simulator would mean something else in the new one.
 
     Raises:
-        CheckpointError: the message names the settings to choose.
+        CheckpointError: the networks have other settings, or weights by place and another layout; or graphs have features relative to another spacing or frame
+            interval, or another scale of a material parameter. The message says what to choose.
     """
     if different := _different(new, trained, "model."):
         raise CheckpointError(f"the model to start from is another one; choose {' '.join(different)}")
+    if not new.model.has_named_weights:
+        _check_layout(new, trained)
+    _check_reference(new, trained)
+    _check_parameter_scale(new, trained)
 
 
 @torch.no_grad()
@@ -72,7 +80,7 @@ def start_from(new: LearnedSimulator, trained: LearnedSimulator) -> Transfer:
     Trained ranges then cover both trainings, for materials that both have with the same parameters.
 
     Raises:
-        CheckpointError: the networks have other settings (``check_model``).
+        CheckpointError: weights of the trained simulator would mean something else (``check_model``).
     """
     check_model(new, trained)
     if different := _different(new, trained, "graph."):
@@ -145,7 +153,66 @@ def _choices(simulator: LearnedSimulator) -> dict[str, str]:
 
 def _same_scales(new: LearnedSimulator, trained: LearnedSimulator) -> bool:
     here, there = new.builder.metadata, trained.builder.metadata
-    return here.dim == there.dim and abs(here.frame_dt / there.frame_dt - 1) < 1e-6 and abs(here.spacing / there.spacing - 1) < 0.01
+    return here.dim == there.dim and have_same_scales(here, there)
+
+
+def _check_layout(new: LearnedSimulator, trained: LearnedSimulator) -> None:
+    here, there = _layout(new.builder.spec), _layout(trained.builder.spec)
+    other = next((part for part in here if here[part] != there[part]), None)
+    if other is not None:
+        graph = _different(new, trained, "graph.")
+        raise CheckpointError(
+            f"{type(new.model).__name__} places its weights by the order of materials, parameters and features, and {other} differ: {there[other]} of the "
+            f"model to start from, {here[other]} of the new one; choose data with the same dimension, materials, parameters and loads"
+            f"{', with ' + ' '.join(graph) if graph else ''}, or train both with model=gpe_tuned, which finds its weights by name"
+        )
+
+
+def _layout(spec: FeatureSpec) -> dict[str, str]:
+    """Return what gives weights without names their places, as text for messages."""
+    channels = {role(t): f"{count} of {role(t)}" for t, count in spec.node_channels.items()}
+    relations = {
+        named(r): f"{spec.odd_channels[r]} odd and {spec.even_channels[r]} even of {named(r)}" for r in spec.relations
+    }  # levels of virtual nodes have the same weights
+    parameters = [f"{p.name} of {material}" for material, own in spec.parameters.items() for p in own]
+    parts = {
+        "materials": spec.materials,
+        "parameters": parameters,
+        "channels of nodes": channels.values(),
+        "channels of edges": relations.values(),
+    }
+    return {"dimensions": f"{spec.dim}"} | {part: ", ".join(values) or "none" for part, values in parts.items()}
+
+
+def _check_reference(new: LearnedSimulator, trained: LearnedSimulator) -> None:
+    here, there = _reference(new), _reference(trained)
+    if trained.builder.config.scales != "one" and not have_same_scales(here, there):
+        raise CheckpointError(
+            f"features of the model to start from are relative to spacing={there.spacing:g} m and frame_dt={there.frame_dt:g} s "
+            f"(graph.scales={trained.builder.config.scales}), those of the new one to {here.spacing:g} m and {here.frame_dt:g} s; evaluate the model on "
+            "other frames as it is with python -m gpe_pl.evaluate … data.stride=…, or choose data with that spacing and frame interval"
+        )
+
+
+def _check_parameter_scale(new: LearnedSimulator, trained: LearnedSimulator) -> None:
+    for material, source in source_materials(new.builder.spec.materials, trained.builder.spec.materials).items():
+        here = dict(zip(_parameters(new, material), new.standardizer.is_log(material), strict=True))
+        there = dict(zip(_parameters(trained, source), trained.standardizer.is_log(source), strict=True))
+        for name in here.keys() & there.keys():
+            if here[name] != there[name]:
+                scale = _choices(trained)["graph.parameter_scale"]
+                read = "the logarithm" if there[name] else "the value"
+                raise CheckpointError(f"the model to start from reads {read} of {name} of {source}; choose graph.parameter_scale={scale}")
+
+
+def _reference(simulator: LearnedSimulator) -> Metadata:
+    """Return metadata with the spacing and frame interval that are the units of features."""
+    return simulator.builder.reference or simulator.builder.metadata
+
+
+def _has_same_scale_features(new: LearnedSimulator, trained: LearnedSimulator) -> bool:
+    """Tell whether both simulators are for several scales and have the same features of them."""
+    return new.builder.config.scales == trained.builder.config.scales != "one" and have_same_scales(_reference(new), _reference(trained))
 
 
 def _parameters(simulator: LearnedSimulator, material: str) -> list[str]:

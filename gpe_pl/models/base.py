@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -60,6 +60,8 @@ class Model(nn.Module, ABC):
     spec: FeatureSpec
     settings: dict[str, Any]
     skips: Skips = Skips()
+    has_named_weights: ClassVar[bool] = False
+    """Whether the names of weights tell their materials and relations. Otherwise the order of the ``FeatureSpec`` gives weights their places."""
     compute: Callable[..., Any]
     """Does the work of ``forward`` on tensors in dictionaries and tuples. Training may replace it on a model by its ``torch.compile`` version."""
 

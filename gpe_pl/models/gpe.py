@@ -95,6 +95,8 @@ class GPE(Model):
         CellError: ``elastic`` or ``stress_unit="strain"`` without cells in the graphs, or both together.
     """
 
+    has_named_weights = True
+
     def __init__(
         self,
         spec: FeatureSpec,

@@ -6,6 +6,7 @@ import logging
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -13,25 +14,35 @@ from torch import Tensor
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
-from gpe_pl.learned.transfer import keep_rollout_settings, keep_trained_ranges, source_materials
-from gpe_pl.models.base import LayersError
+from gpe_pl.learned.transfer import check_model, keep_rollout_settings, keep_trained_ranges, source_materials
+from gpe_pl.models.base import LayersError, Model
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
-from gpe_pl.schema import node_code
+from gpe_pl.schema import node_code, param_names
 from gpe_pl.training.optimizer import train_only
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata
 from tests import scenes
 
 
-def simulator(metadata: Metadata, seed: int = 0, config: GraphConfig | None = None, **settings: Any) -> LearnedSimulator:
+def simulator(
+    metadata: Metadata, seed: int = 0, config: GraphConfig | None = None, model: type[Model] = GPE, **settings: Any
+) -> LearnedSimulator:
     """Return a simulator with random weights, and with statistics of one random graph."""
     torch.manual_seed(seed)
     builder = GraphBuilder(config or GraphConfig(history=1, islands=True), metadata)
-    made = LearnedSimulator(GPE(builder.spec, **{"num_message_passing_steps": 2, "hidden_channels": 8, **settings}), builder)
-    graph = builder(scenes.state(60, metadata.materials, history=builder.config.history, seed=seed, dim=metadata.dim).to_torch())
+    size = {} if model is ContinuousConvNet else {"hidden_channels": 8}
+    size |= {"num_message_passing_steps": 2} if model in (GPE, GNS) else {}
+    made = LearnedSimulator(model(builder.spec, **{**size, **settings}), builder)
+    drawn = scenes.state(60, metadata.materials, history=builder.config.history, seed=seed, dim=metadata.dim)
+    if builder.config.cells:
+        drawn = scenes.mesh_state("tetrahedra" if metadata.dim == 3 else "triangles", metadata.materials, seed=seed)
+    num_further = len(metadata.param_names) - len(param_names(metadata.materials))
+    further = np.random.default_rng(seed).uniform(0.1, 0.4, (drawn.num_nodes, num_further))
+    drawn = replace(drawn, material_params=np.concatenate([drawn.material_params, further], axis=1), param_names=metadata.param_names)
+    graph = builder(drawn.to_torch())
     for material in metadata.materials:
         graph[material].target = (1.0 + seed) * torch.randn(graph[material].num_nodes, metadata.dim)
     made.fit_statistics([graph])
@@ -112,6 +123,67 @@ def test_another_network_is_refused_and_nothing_is_changed() -> None:
     with pytest.raises(CheckpointError, match="choose model.hidden_channels=8$"):
         new.start_from(trained)
     torch.testing.assert_close(new.state_dict(), before, rtol=0, atol=0)
+
+
+def assert_refused(new: LearnedSimulator, trained: LearnedSimulator, message: str) -> None:
+    before = {name: value.clone() for name, value in new.state_dict().items()}
+    for start in (check_model, LearnedSimulator.start_from):
+        with pytest.raises(CheckpointError, match=message):
+            start(new, trained)
+    torch.testing.assert_close(new.state_dict(), before, rtol=0, atol=0)
+
+
+SAND = scenes.metadata(("sand",))
+WITH_COHESION = replace(SAND, param_names=("friction_angle", "cohesion"))
+
+
+@pytest.mark.parametrize("model", [GNS, DPINet, ContinuousConvNet])
+@pytest.mark.parametrize(
+    ("before", "now", "config", "message"),
+    [
+        (scenes.metadata(("snow", "fluid")), scenes.metadata(("sand", "snow")), None, "materials differ: snow, fluid of .* sand, snow of"),
+        (
+            SAND,
+            scenes.metadata(("snow",)),
+            None,
+            "materials differ: sand of the model to start from, snow of the new one; .* model=gpe_tuned",
+        ),
+        (SAND, WITH_COHESION, None, "parameters differ: friction_angle of sand of .*, friction_angle of sand, cohesion of sand of"),
+        (SAND, scenes.metadata(("sand",), dim=3), None, "dimensions differ: 2 of the model"),
+        (SAND, SAND, GraphConfig(history=3, islands=True), "channels of nodes differ: .* and loads, with graph.history=1, or train"),
+        (
+            SAND,
+            SAND,
+            GraphConfig(history=1, islands=True, features="paper"),
+            "channels of edges differ: .* with graph.features=contact, or",
+        ),
+    ],
+)
+def test_models_whose_weights_have_places_start_on_the_same_layout_only(
+    model: type[Model], before: Metadata, now: Metadata, config: GraphConfig | None, message: str
+) -> None:
+    trained = simulator(before, model=model)
+    assert_refused(simulator(now, 1, config, model), trained, f"{model.__name__} places its weights .* and {message}")
+    assert simulator(replace(before, frame_dt=0.01), 1, model=model).start_from(trained).new == {}
+
+
+@pytest.mark.parametrize("change", [{"frame_dt": 0.01}, {"spacing": 0.1}])
+def test_several_scales_relative_to_others_are_refused(change: dict[str, float]) -> None:
+    config, other = GraphConfig(history=1, islands=True, scales="dimensionless"), replace(SAND, **change)
+    here = f"{other.spacing:g} m and {other.frame_dt:g} s"
+    message = rf"spacing=0.05 m and frame_dt=0.005 s \(graph.scales=dimensionless\), those of the new one to {here}; .*gpe_pl.evaluate"
+    assert_refused(simulator(other, 1, config), simulator(SAND, config=config), message)
+    assert_refused(simulator(other, 1), simulator(SAND, config=config), message)
+
+
+@pytest.mark.parametrize("model", [GPE, GNS])
+@pytest.mark.parametrize(("scale", "other", "read"), [(None, "linear", "the logarithm"), ("linear", None, "the value")])
+def test_another_scale_of_a_copied_parameter_is_refused(model: type[Model], scale: Any, other: Any, read: str) -> None:
+    fluid, sand = scenes.metadata(("fluid",)), SAND
+    before, now = (GraphConfig(history=1, islands=True, parameter_scale=s) for s in (scale, other))
+    message = f"reads {read} of kinematic_viscosity of fluid; choose graph.parameter_scale={scale or 'null'}$"
+    assert_refused(simulator(fluid, 1, now, model), simulator(fluid, config=before, model=model), message)
+    simulator(sand, 1, now, model).start_from(simulator(sand, config=before, model=model))  # its parameter has no logarithmic scale
 
 
 def test_materials_take_the_weights_of_their_kind() -> None:
