@@ -77,7 +77,7 @@ def check_model(new: LearnedSimulator, trained: LearnedSimulator) -> None:
 def start_from(new: LearnedSimulator, trained: LearnedSimulator) -> Transfer:
     """Copy to a new simulator, whose statistics are set, what fits of the weights and statistics of a trained one, and log what was copied and what is new.
 
-    Trained ranges then cover both trainings, for materials that both have with the same parameters.
+    Trained ranges then cover both trainings, for materials and parameters that both have.
 
     Raises:
         CheckpointError: weights of the trained simulator would mean something else (``check_model``).
@@ -109,13 +109,17 @@ def keep_rollout_settings(new: LearnedSimulator, trained: LearnedSimulator) -> N
 
 
 def keep_trained_ranges(new: LearnedSimulator, trained: LearnedSimulator) -> None:
-    """Give a simulator that is not trained the ranges of the trained one, so that values outside them are still outside. Materials that are new keep theirs."""
+    """Give a simulator that is not trained the ranges of the trained one, so that values outside them are still outside.
+
+    New materials and parameters keep theirs.
+    """
     before, known = dict(trained.trained_ranges()), [*trained.builder.spec.materials]
     for k, (material, values) in enumerate(new.trained_ranges()):
         if material in known:
             new.trained_mass[:, k] = trained.trained_mass[:, known.index(material)]
-            if _parameters(new, material) == _parameters(trained, material):
-                values.copy_(before[material])
+            _copy_columns(values, before[material], _parameters(new, material), _parameters(trained, material))
+    if _has_same_scale_features(new, trained):
+        new.trained_scales.copy_(trained.trained_scales)
     if new.trained_scene.shape == trained.trained_scene.shape:
         new.trained_scene.copy_(trained.trained_scene)
 
@@ -149,11 +153,6 @@ def _choices(simulator: LearnedSimulator) -> dict[str, str]:
         for part, values in parts.items()
         for key, value in values.items()
     }
-
-
-def _same_scales(new: LearnedSimulator, trained: LearnedSimulator) -> bool:
-    here, there = new.builder.metadata, trained.builder.metadata
-    return here.dim == there.dim and have_same_scales(here, there)
 
 
 def _check_layout(new: LearnedSimulator, trained: LearnedSimulator) -> None:
@@ -213,6 +212,11 @@ def _reference(simulator: LearnedSimulator) -> Metadata:
 def _has_same_scale_features(new: LearnedSimulator, trained: LearnedSimulator) -> bool:
     """Tell whether both simulators are for several scales and have the same features of them."""
     return new.builder.config.scales == trained.builder.config.scales != "one" and have_same_scales(_reference(new), _reference(trained))
+
+
+def _same_scales(new: LearnedSimulator, trained: LearnedSimulator) -> bool:
+    here, there = new.builder.metadata, trained.builder.metadata
+    return here.dim == there.dim and have_same_scales(here, there)
 
 
 def _parameters(simulator: LearnedSimulator, material: str) -> list[str]:
@@ -279,16 +283,23 @@ def _copy_columns(own: Tensor, theirs: Tensor | None, names: Sequence[str], thei
     return len(known)
 
 
+def _union(one: Tensor, other: Tensor) -> Tensor:
+    """Return the smallest ranges [2, …] of lowest and highest values that contain both."""
+    return torch.stack([torch.minimum(one[0], other[0]), torch.maximum(one[1], other[1])])
+
+
 def _unite_ranges(new: LearnedSimulator, trained: LearnedSimulator) -> None:
     before, known = dict(trained.trained_ranges()), [*trained.builder.spec.materials]
     for k, (material, values) in enumerate(new.trained_ranges()):
         if material not in known:
             continue
         masses, theirs = new.trained_mass[:, k], trained.trained_mass[:, known.index(material)]
-        masses.copy_(torch.stack([torch.minimum(masses[0], theirs[0]), torch.maximum(masses[1], theirs[1])]))
-        if _parameters(new, material) == _parameters(trained, material):
-            set_ranges = [r for r in (before[material], values.clone()) if bool(r.isfinite().all())]
-            if set_ranges:
-                values.copy_(torch.stack([torch.stack(set_ranges).amin(dim=0)[0], torch.stack(set_ranges).amax(dim=0)[1]]))
+        masses.copy_(_union(masses, theirs))
+        theirs = values.clone()
+        _copy_columns(theirs, before[material], _parameters(new, material), _parameters(trained, material))
+        is_known, was_known = (r.isfinite().all(dim=0) for r in (values, theirs))
+        values.copy_(torch.where(is_known & was_known, _union(values, theirs), torch.where(was_known, theirs, values)))
+    if _has_same_scale_features(new, trained):
+        new.trained_scales.copy_(_union(new.trained_scales, trained.trained_scales))
     if new.trained_scene.shape == trained.trained_scene.shape:
         new.trained_scene.copy_(torch.from_numpy(united([trained.trained_scene.cpu().numpy(), new.trained_scene.cpu().numpy()])))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -165,6 +165,37 @@ def test_models_whose_weights_have_places_start_on_the_same_layout_only(
     trained = simulator(before, model=model)
     assert_refused(simulator(now, 1, config, model), trained, f"{model.__name__} places its weights .* and {message}")
     assert simulator(replace(before, frame_dt=0.01), 1, model=model).start_from(trained).new == {}
+
+
+def test_ranges_of_known_parameters_cover_both_trainings() -> None:
+    """Also if the data store other parameters besides."""
+    trained = simulator(SAND)
+    trained.get_buffer("trained_sand").copy_(torch.tensor([[10.0], [40.0]]))
+    new = simulator(WITH_COHESION, 1)
+    own = torch.tensor([[20.0, 1.0], [50.0, 2.0]], dtype=torch.float64)
+    new.get_buffer("trained_sand").copy_(own)
+    new.start_from(trained)
+    assert new.get_buffer("trained_sand").tolist() == [[10.0, 1.0], [50.0, 2.0]]
+    keep_trained_ranges(new, trained)
+    assert new.get_buffer("trained_sand").tolist() == [[10.0, 1.0], [40.0, 2.0]]
+    fewer = simulator(SAND, 1)
+    fewer.get_buffer("trained_sand").copy_(own[:, :1])
+    fewer.start_from(new)
+    assert fewer.get_buffer("trained_sand").tolist() == [[10.0], [50.0]]
+
+
+@pytest.mark.parametrize("model", [GPE, GNS])
+@pytest.mark.parametrize("scales", ["dimensional", "dimensionless"])
+def test_ranges_of_scales_cover_both_trainings(model: type[Model], scales: Literal["dimensional", "dimensionless"]) -> None:
+    config = GraphConfig(history=1, islands=True, scales=scales)
+    trained, new = (simulator(SAND, seed, config, model) for seed in (0, 1))
+    trained.trained_scales.copy_(torch.tensor([[0.05, 0.005], [0.1, 0.01]]))
+    new.trained_scales.copy_(torch.tensor([[0.02, 0.005], [0.05, 0.02]]))
+    both = torch.stack([new.trained_scales[0], torch.tensor([0.1, 0.02])])
+    new.start_from(trained)
+    torch.testing.assert_close(new.trained_scales, both.double(), check_dtype=False)
+    keep_trained_ranges(new, trained)
+    assert torch.equal(new.trained_scales, trained.trained_scales)
 
 
 @pytest.mark.parametrize("change", [{"frame_dt": 0.01}, {"spacing": 0.1}])
