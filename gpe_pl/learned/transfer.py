@@ -5,7 +5,7 @@ if it has the same shape. Weights that read material parameters are matched by t
 predictions do not depend on them at first. Models whose weights have places instead of names (``Model.has_named_weights``) start on the same layout only.
 
 Statistics are copied if both simulators have the same dimension, frame interval and spacing. Otherwise the new ones are kept, because motion in units of its
-statistics is alike at all scales.
+statistics is alike at all scales. Learned laws of elastic bodies are converted, so that they give the same stresses in Pa.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
@@ -93,6 +93,7 @@ def start_from(new: LearnedSimulator, trained: LearnedSimulator) -> Transfer:
         log.warning(
             "start_from: the trained model has another dimension, frame interval or spacing, so statistics are those of the new data"
         )
+    _convert_units(new, trained, sources)
     new.set_units_of(new.model)
     _unite_ranges(new, trained)
     log.info("start_from: %s", transfer)
@@ -225,7 +226,7 @@ def _parameters(simulator: LearnedSimulator, material: str) -> list[str]:
 
 def _copy_weights(new: LearnedSimulator, trained: LearnedSimulator, sources: dict[str, str]) -> Transfer:
     theirs = trained.model.state_dict()
-    reading = {name: material for material, name in new.model.parameter_weights().items()}
+    reading = new.model.parameter_weights()
     for name, buffer in new.model.named_buffers():
         _copied(buffer, theirs.get(_source_name(name, sources)))
     fresh: dict[str, nn.Parameter] = {}
@@ -263,6 +264,22 @@ def _copy_statistics(new: LearnedSimulator, trained: LearnedSimulator, sources: 
         new.standardizer.mass.copy_(trained.standardizer.mass)
         new.stress_std.copy_(trained.stress_std)
     new.forget_known_statistics()
+
+
+def _convert_units(new: LearnedSimulator, trained: LearnedSimulator, sources: dict[str, str]) -> None:
+    """Rewrite copied weights that stand for stresses or viscosities, so that these are the same functions of material parameters in SI units."""
+    stress, time = _stress_unit(trained) / _stress_unit(new), trained.frame_dt / new.frame_dt
+    for material, source in sources.items():
+        here, there = (cast(Standardize, s.standardizer.params[m]) for s, m in ((new, material), (trained, source)))
+        mean, std = here.mean.clone(), here.std.clone()
+        for own, theirs in ((mean, there.mean), (std, there.std)):
+            _copy_columns(own, theirs, _parameters(new, material), _parameters(trained, source))
+        new.model.convert_units(material, stress, time, shift=(here.mean - mean) / std, scale=here.std / std)
+
+
+def _stress_unit(simulator: LearnedSimulator) -> float:
+    """Return the unit of the constants of elastic bodies [Pa]: mean mass × spacing^(2 − dim) per frame²."""
+    return float(simulator.standardizer.mass) * simulator.spacing ** (2 - simulator.builder.spec.dim) / simulator.frame_dt**2
 
 
 def _copied(own: Tensor, theirs: Tensor | None) -> bool:

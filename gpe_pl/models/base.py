@@ -92,8 +92,21 @@ class Model(nn.Module, ABC):
         raise LayersError(f"{type(self).__name__} has no layers of single message-passing steps; choose training.early_layers=null")
 
     def parameter_weights(self) -> dict[str, str]:
-        """Return the name of the weights [hidden, param] that read the parameters of each material. Others, whose weights read further features, are absent."""
+        """Return the material whose parameters each tensor of weights [..., param] reads, by name of the tensor.
+
+        Weights that also read other features are absent.
+        """
         return {}
+
+    def convert_units(self, material: str, stress: float, time: float, shift: Tensor, scale: Tensor) -> None:
+        """Rewrite weights that stand for stresses or viscosities as functions of material parameters, so that they mean the same in other units.
+
+        Args:
+            material: name of the material.
+            stress: previous unit of stresses (see ``set_units``) over the new one.
+            time: previous frame interval over the new one.
+            shift, scale: the parameters as they were standardised before [param] are ``shift`` + ``scale`` × those as they are standardised now.
+        """
 
     def set_units(self, acceleration: float, spacing: float, stress: float) -> None:
         """Tell the model the units of a data set, before training.

@@ -234,7 +234,17 @@ class GPE(Model):
 
     def parameter_weights(self) -> dict[str, str]:
         first = "weight" if self.settings["material_embedding"] == "affine" else "0.weight"
-        return {m: f"material_embedding.{m}.theta.{first}" for m in self.material_embedding}
+        names = {f"material_embedding.{m}.theta.{first}": m for m in self.material_embedding}
+        if self.settings["elastic"]:
+            read = [
+                (m, name) for m in self.elastic_bodies.constants if m in self.material_embedding for name in self.elastic_bodies.laws(m)
+            ]
+            names |= {f"elastic_bodies.{name}.weight": m for m, name in read}
+        return names
+
+    def convert_units(self, material: str, stress: float, time: float, shift: Tensor, scale: Tensor) -> None:
+        if self.settings["elastic"] and material in self.elastic_bodies.constants:
+            self.elastic_bodies.convert_units(material, stress, time, shift, scale)
 
     @property
     def num_hops(self) -> int:

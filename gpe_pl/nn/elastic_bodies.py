@@ -160,6 +160,21 @@ class ElasticBodies(nn.Module):
         self.spacing.fill_(spacing)
         self.stress_unit.fill_(stress)
 
+    def laws(self, material: str) -> dict[str, nn.ParameterDict]:
+        """Return the weights and biases of a material that give logarithms of constants from its standardised parameters, by name."""
+        laws = {f"constants.{material}.logarithm": cast(Constants, self.constants[material]).logarithm}
+        layer = cast(BodyLayer, self.body_layer[material])
+        return laws | ({f"body_layer.{material}.logarithm": layer.logarithm} if layer.has_thickness else {})
+
+    @torch.no_grad()
+    def convert_units(self, material: str, stress: float, time: float, shift: Tensor, scale: Tensor) -> None:
+        """Rewrite the laws of a material so that they mean the same in other units and of parameters with other statistics; see ``Model.convert_units``."""
+        cast(Constants, self.constants[material]).convert_units(stress, time)
+        for law in self.laws(material).values():
+            if law["weight"].shape[1]:
+                law["bias"].add_((law["weight"].double() @ shift.double()).to(law["bias"]))
+                law["weight"].mul_(scale)
+
     def forward(
         self, data: HeteroData, acceleration: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], with_stress: bool
     ) -> Moved:

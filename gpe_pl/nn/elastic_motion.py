@@ -528,6 +528,11 @@ class Constants(nn.Module):
             {"weight": torch.zeros(3, param_channels), "bias": guess.log() / LOGARITHM_SCALE}
         )
 
+    def convert_units(self, stress: float, time: float) -> None:
+        """Rewrite the constants for units of stress and time of which the previous ones were ``stress`` and ``time`` times as large. η is a stress × time."""
+        shift = torch.tensor([stress, stress, stress * time], dtype=torch.float64).log() / LOGARITHM_SCALE
+        self.logarithm["bias"][: self.num_learned] += shift[: self.num_learned].to(self.logarithm["bias"])
+
     def forward(self, params: Float[Tensor, "node param"]) -> tuple[Float[Tensor, " node"], Float[Tensor, " node"], Float[Tensor, " node"]]:
         """Return λ, μ and η, each from e⁻²⁰ to e²⁰."""
         weight, bias = (

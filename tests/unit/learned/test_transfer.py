@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import pytest
@@ -20,11 +21,19 @@ from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
+from gpe_pl.nn.blocks import Standardize
+from gpe_pl.nn.elastic_motion import Constants
+from gpe_pl.nn.elastic_touch import BodyLayer
 from gpe_pl.schema import node_code, param_names
 from gpe_pl.training.optimizer import train_only
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata
 from tests import scenes
+
+LAW = {"elastic": True, "body_layer": 1.0, "decoder": "contact", "only_contacts": True}
+"""Settings of GPE with the elastic law, for graphs of ``CELLS``."""
+CELLS = GraphConfig(history=1, islands=True, mesh=True, cells=True)
+E, NU = "youngs_modulus", "poisson_ratio"
 
 
 def simulator(
@@ -165,6 +174,59 @@ def test_models_whose_weights_have_places_start_on_the_same_layout_only(
     trained = simulator(before, model=model)
     assert_refused(simulator(now, 1, config, model), trained, f"{model.__name__} places its weights .* and {message}")
     assert simulator(replace(before, frame_dt=0.01), 1, model=model).start_from(trained).new == {}
+
+
+def law(trained: LearnedSimulator, young: float) -> dict[str, Tensor]:
+    """Return λ and μ in Pa and η in Pa s of a material with a Young's modulus, and the logarithms of the layer between bodies, which have no unit."""
+    (material,), dt = trained.builder.spec.materials, trained.frame_dt
+    standardized = cast(Standardize, trained.standardizer.params[material])
+    params = standardized.mean.clone()[None]
+    params[0, 0] = math.log(young)
+    params = standardized(params).float()
+    bodies = cast(GPE, trained.model).elastic_bodies
+    unit = float(trained.standardizer.mass) * trained.spacing ** (2 - bodies.dim) / dt**2
+    constants = cast(Constants, bodies.constants[material])(params)
+    layer = cast(BodyLayer, bodies.body_layer[material]).logarithm
+    return {
+        "constants": torch.cat([unit * constants[0], unit * constants[1], unit * dt * constants[2]]),
+        "layer": torch.nn.functional.linear(params, layer["weight"], layer["bias"]),
+    }
+
+
+SOLID = scenes.metadata(("solid",))
+
+
+@pytest.mark.parametrize(
+    ("before", "now"),
+    [
+        (SOLID, SOLID),
+        (SOLID, replace(SOLID, param_names=(E, NU))),
+        (replace(SOLID, param_names=(E, NU)), SOLID),
+        (SOLID, replace(SOLID, frame_dt=2 * SOLID.frame_dt)),
+        (SOLID, replace(SOLID, spacing=2 * SOLID.spacing)),
+        (SOLID, scenes.metadata(("solid",), dim=3)),
+        (scenes.metadata(("solid",), dim=3), replace(scenes.metadata(("solid",), dim=3), spacing=0.1, param_names=(E, NU))),
+        (SOLID, scenes.metadata(("elastomer",))),
+    ],
+)
+def test_the_elastic_law_stays_the_same_in_pascal(before: Metadata, now: Metadata) -> None:
+    """Whatever other parameters the data have, and whatever their scales and statistics."""
+    trained = simulator(before, config=CELLS, **LAW)
+    with torch.no_grad():
+        for name, parameter in trained.model.named_parameters():
+            if "logarithm" in name:
+                parameter += 0.1 * torch.randn_like(parameter)
+    new = simulator(now, 1, CELLS, **LAW)
+    new.start_from(trained)
+    for young in (5.0, 20.0):
+        torch.testing.assert_close(law(new, young), law(trained, young), rtol=1e-4, atol=1e-6)
+    assert abs(float((law(trained, 5.0)["constants"] / law(trained, 20.0)["constants"])[1].log())) > 1e-2
+
+
+def test_a_law_that_goes_on_is_not_changed() -> None:
+    trained, new = simulator(SOLID, config=CELLS, **LAW), simulator(SOLID, 1, CELLS, **LAW)
+    new.start_from(trained)
+    torch.testing.assert_close(new.model.state_dict(), trained.model.state_dict(), rtol=0, atol=0)
 
 
 def test_ranges_of_known_parameters_cover_both_trainings() -> None:
