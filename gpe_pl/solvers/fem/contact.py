@@ -11,17 +11,18 @@ Kernels treat two dimensions as three dimensions without depth, so one contact l
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple, no_type_check
 
 import numpy as np
 from numba import njit
 
-from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, Wall
+from gpe_pl.geometry.shapes import Box, DistanceGrid, Polygon, Shape, Sphere, Wall
 from gpe_pl.schema import STICKY
 
 FIELD_CELLS = 64
-"""Number of cells along the longest axis of the grid on which obstacles of other kinds are sampled."""
+"""Number of cells along the longest axis of the grid on which obstacles without nodes of their own, such as bowls, are sampled."""
 
 
 class Obstacles(NamedTuple):
@@ -35,9 +36,10 @@ class Obstacles(NamedTuple):
         edges: start, vector to the end and 1 / length² of the edges of all polygons, counter-clockwise, one polygon after the other [edge, 5].
         first_edge: index of the first edge of each polygon [polygon + 1].
         corners: x, y and friction of convex polygon vertices [corner, 3].
-        fields: signed distances of shapes of any other kind on a grid over the domain [field, x, y, z] in m.
-        field_friction: friction of each field [field].
-        grid: low corner and spacing of that grid [4] in m.
+        fields: signed distances [m] of each shape of any other kind at the nodes of a grid, in C order, one field after the other.
+        first_value: index in ``fields`` of the first value of each field [field + 1].
+        field_counts: number of nodes of each field along x, y and z [field, 3]; 2 along z in 2D.
+        field_grids: low corner, spacing and friction of each field [field, 5].
     """
 
     planes: np.ndarray
@@ -48,8 +50,9 @@ class Obstacles(NamedTuple):
     first_edge: np.ndarray
     corners: np.ndarray
     fields: np.ndarray
-    field_friction: np.ndarray
-    grid: np.ndarray
+    first_value: np.ndarray
+    field_counts: np.ndarray
+    field_grids: np.ndarray
 
 
 @lru_cache(maxsize=8)
@@ -58,7 +61,6 @@ def collect(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...]) 
     dim = len(bounds)
     depth = (0.0,) * (3 - dim)
     low, high = np.array(bounds, dtype=np.float64).T
-    spacing = float(np.max(high - low)) / FIELD_CELLS
     planes: list = []
     spheres: list = []
     boxes: list = []
@@ -67,7 +69,7 @@ def collect(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...]) 
     first_edge = [0]
     corners: list = []
     fields: list = []
-    field_friction: list = []
+    field_grids: list = []
     for shape in shapes:
         mu = shape.friction
         if isinstance(shape, Wall):
@@ -85,8 +87,9 @@ def collect(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...]) 
             edges.extend(np.concatenate([outline, after, 1.0 / np.sum(after**2, axis=1, keepdims=True)], axis=1))
             first_edge.append(len(edges))
         else:
-            fields.append(_sampled(shape, low, high, spacing))
-            field_friction.append(mu)
+            origin, spacing, distance = _sampled(shape, low, high)
+            fields.append(distance if dim == 3 else np.stack([distance, distance], axis=-1))
+            field_grids.append([*origin, *depth, spacing, mu])
     return Obstacles(
         _table(planes, 5),
         _table(spheres, 5),
@@ -95,9 +98,10 @@ def collect(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...]) 
         _table(edges, 5),
         np.array(first_edge, dtype=np.int64),
         _table(corners, 3),
-        np.array(fields, dtype=np.float64) if fields else np.empty((0, 2, 2, 2)),
-        np.array(field_friction, dtype=np.float64),
-        np.array([*low, *depth, spacing], dtype=np.float64),
+        np.concatenate([np.empty(0), *(field.ravel() for field in fields)]),
+        np.cumsum([0, *(field.size for field in fields)]),
+        np.array([field.shape for field in fields], dtype=np.int64).reshape(-1, 3),
+        _table(field_grids, 5),
     )
 
 
@@ -112,11 +116,16 @@ def _outline(shape: Box | Polygon) -> np.ndarray:
     return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], dtype=np.float64)
 
 
-def _sampled(shape: Shape, low: np.ndarray, high: np.ndarray, spacing: float) -> np.ndarray:
-    """Return the signed distance [x, y, z] in m on grid points that cover the domain; without depth in 2D."""
+def _sampled(shape: Shape, low: np.ndarray, high: np.ndarray) -> tuple[Sequence[float] | np.ndarray, float, np.ndarray]:
+    """Return the first node [dim] in m, the spacing [m] and the signed distances [x, y(, z)] in m of a grid.
+
+    A ``DistanceGrid`` keeps its own nodes. Any other shape is sampled over the domain.
+    """
+    if isinstance(shape, DistanceGrid):
+        return shape.origin, shape.spacing, shape.values
+    spacing = float(np.max(high - low)) / FIELD_CELLS
     axes = [a + spacing * np.arange(math.ceil((b - a) / spacing - 1e-9) + 1) for a, b in zip(low, high, strict=True)]
-    distance = shape.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
-    return distance if len(axes) == 3 else np.stack([distance, distance], axis=-1)
+    return low, spacing, shape.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
 
 
 @njit(cache=True, error_model="numpy")
@@ -199,13 +208,14 @@ def _polygon_gap(x, y, edges, start, stop):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _field_gap(x, y, z, field, grid):
-    """Interpolate a sampled distance trilinearly; return it and the direction of its gradient."""
+    """Interpolate a sampled distance trilinearly, and continue it linearly outside its grid. Return it and the direction of its gradient."""
     inv = 1.0 / grid[3]
-    fx, fy, fz = (x - grid[0]) * inv, (y - grid[1]) * inv, (z - grid[2]) * inv
-    i = min(max(int(fx), 0), field.shape[0] - 2)
-    j = min(max(int(fy), 0), field.shape[1] - 2)
-    k = min(max(int(fz), 0), field.shape[2] - 2)
-    fx, fy, fz = fx - i, fy - j, fz - k
+    px, py, pz = (x - grid[0]) * inv, (y - grid[1]) * inv, (z - grid[2]) * inv
+    i = min(max(int(px), 0), field.shape[0] - 2)
+    j = min(max(int(py), 0), field.shape[1] - 2)
+    k = min(max(int(pz), 0), field.shape[2] - 2)
+    px, py, pz = px - i, py - j, pz - k
+    fx, fy, fz = min(max(px, 0.0), 1.0), min(max(py, 0.0), 1.0), min(max(pz, 0.0), 1.0)
     gap = gx = gy = gz = 0.0
     for a in range(2):
         wx, sx = (fx, 1.0) if a == 1 else (1.0 - fx, -1.0)
@@ -218,10 +228,19 @@ def _field_gap(x, y, z, field, grid):
                 gx += sx * wy * wz * d
                 gy += wx * sy * wz * d
                 gz += wx * wy * sz * d
+    gap += gx * (px - fx) + gy * (py - fy) + gz * (pz - fz)
     length = math.sqrt(gx * gx + gy * gy + gz * gz)
     if length > 0.0:
         return gap, gx / length, gy / length, gz / length
     return gap, 0.0, 1.0, 0.0
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _field(obstacles, k):
+    """Return the values [x, y, z] of field number k."""
+    nx, ny, nz = obstacles.field_counts[k]
+    return obstacles.fields[obstacles.first_value[k] : obstacles.first_value[k + 1]].reshape((nx, ny, nz))
 
 
 @njit(cache=True, error_model="numpy")
@@ -275,11 +294,12 @@ def resist_nodes(pos, vel, box, reach, h, obstacles):
             gap, nx, ny, nz = _box_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.boxes[k])
             if gap < reach:
                 _slow(vel, p, gap, nx, ny, nz, friction, h)
-    for k in range(obstacles.fields.shape[0]):
+    for k in range(obstacles.field_grids.shape[0]):
+        field, grid = _field(obstacles, k), obstacles.field_grids[k]
         for p in range(pos.shape[0]):
-            gap, nx, ny, nz = _field_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.fields[k], obstacles.grid)
+            gap, nx, ny, nz = _field_gap(pos[p, 0], pos[p, 1], pos[p, 2], field, grid)
             if gap < reach:
-                _slow(vel, p, gap, nx, ny, nz, obstacles.field_friction[k], h)
+                _slow(vel, p, gap, nx, ny, nz, grid[4], h)
     for k in range(obstacles.planes.shape[0]):
         nx, ny, nz, offset, friction = obstacles.planes[k]
         if _beyond(box, reach, obstacles.planes[k]):
@@ -321,9 +341,10 @@ def push_out_nodes(pos, box, reach, obstacles):
         for p in range(pos.shape[0]):
             gap, nx, ny, nz = _box_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.boxes[k])
             _push(pos, p, gap, nx, ny, nz)
-    for k in range(obstacles.fields.shape[0]):
+    for k in range(obstacles.field_grids.shape[0]):
+        field, grid = _field(obstacles, k), obstacles.field_grids[k]
         for p in range(pos.shape[0]):
-            gap, nx, ny, nz = _field_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.fields[k], obstacles.grid)
+            gap, nx, ny, nz = _field_gap(pos[p, 0], pos[p, 1], pos[p, 2], field, grid)
             _push(pos, p, gap, nx, ny, nz)
     for k in range(obstacles.planes.shape[0]):
         nx, ny, nz, offset, _ = obstacles.planes[k]

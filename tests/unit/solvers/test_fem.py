@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from gpe_pl.geometry.shapes import Box, Polygon, Sphere, domain_walls
+from gpe_pl.geometry.shapes import Box, DistanceGrid, Polygon, Sphere, domain_walls
 from gpe_pl.rollout.loop import SimulationError, Simulator
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers import fem as fem_package
@@ -251,6 +251,18 @@ def test_node_that_starts_inside_comes_out():
     after = fem.step(state)
     assert ball.signed_distance(after.pos).min() >= -1e-12
     assert np.abs(after.vel).max() < 50
+
+
+def test_a_thin_plate_holds_in_a_large_box_as_a_grid_of_distances_too():
+    plate, axes = Box((0.25, 0.35), (0.75, 0.4), 0.4), [0.2 + 0.02 * np.arange(31), 0.3 + 0.02 * np.arange(8)]
+    values = plate.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+    ends = []
+    for shape in (plate, DistanceGrid.from_values((0.2, 0.3), 0.02, values, 0.4)):
+        fem, state = falling_square((shape,))
+        state = run(replace(fem, bounds=((0.0, 8.0), (0.0, 1.0))), state, 60)
+        assert plate.signed_distance(state.pos).min() > -1e-4
+        ends.append(state.pos)
+    np.testing.assert_allclose(*ends, atol=1e-3)
 
 
 # --- what is refused ------------------------------------------------------------------------------------------------------------------------
