@@ -11,7 +11,7 @@ import numpy as np
 from array_api_compat import array_namespace, device
 
 from gpe_pl.geometry.periodicity import Periodicity
-from gpe_pl.geometry.shapes import Box, Polygon, Shape, Wall, signed_distance, surface_tolerance
+from gpe_pl.geometry.shapes import Box, DistanceGrid, Polygon, Shape, Wall, signed_distance, surface_tolerance
 
 Array = Any
 
@@ -50,17 +50,39 @@ class Repeated:
         centre = xp.asarray(self._centre, dtype=points.dtype, device=device(points))
         near = centre + space.shortest(points - centre)
         # The image with the nearest centre counts if the shape is symmetric, or if each image has its own part of the inside.
-        if not isinstance(self.shape, Polygon):
+        if not isinstance(self.shape, (Polygon, DistanceGrid)):
             return self._whole.signed_distance(near)
-        distance = self._whole.signed_distance(near)
+        distance = self._to_image(near)
         axes = [axis for axis in space.axes if axis != self._spanned]
         for images in itertools.product((-1.0, 0.0, 1.0), repeat=len(axes)):
             if any(images):
                 shift = np.zeros(len(space.period))
                 shift[axes] = np.array(images) * space.period[axes]
                 there = near + xp.asarray(shift, dtype=points.dtype, device=device(points))
-                distance = xp.minimum(distance, self._whole.signed_distance(there))
+                distance = xp.minimum(distance, self._to_image(there))
         return distance
+
+    def _to_image(self, points: Array) -> Array:
+        """Return the signed distance [...] in m of points [..., dim] to the image at the place of the shape.
+
+        Past the nodes of a ``DistanceGrid`` along periodic axes, the linear continuation could make solids where none are. There the distance is that of the
+        surface point which belongs to the nearest point with nodes. If that point is solid, its depth remains, less the way from it.
+        """
+        shape = self._whole
+        if not isinstance(shape, DistanceGrid):
+            return shape.signed_distance(points)
+        xp, repeats = array_namespace(points), np.array(self.periodicity.periodic)
+        origin, size = np.array(shape.origin), shape.spacing * (np.array(shape.counts) - 1)
+        first, last = np.where(repeats, origin, -np.inf), np.where(repeats, origin + size, np.inf)
+        low, high = (xp.asarray(end, dtype=points.dtype, device=device(points)) for end in (first, last))
+        nearest = xp.minimum(xp.maximum(points, low), high)
+        distance, gradient = shape.interpolated(nearest)
+        slope, beyond = _length(gradient)[..., None], points - nearest
+        outward = gradient / xp.where(
+            slope > 0.5, slope, xp.ones_like(slope)
+        )  # where the slope is small, no direction leads to the surface
+        way, to_surface = (_length(vector) for vector in (beyond, beyond + distance[..., None] * outward))
+        return xp.where(way > 0, xp.where(distance > 0, to_surface, distance + way), distance)
 
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
         """Return boundary nodes inside the domain and their normals, each node once. Faces where two images join have no nodes."""
@@ -119,6 +141,13 @@ class Repeated:
         chain = np.concatenate([*(there + shift for shift in shifts), *(back + shift for shift in reversed(shifts))])
         is_new = (np.abs(chain - np.roll(chain, 1, axis=0)) > ON_SEAM * self.periodicity.period[axis]).any(axis=1)
         return replace(polygon, vertices=tuple(map(tuple, chain[is_new].tolist())))
+
+
+def _length(vectors: Array) -> Array:
+    """Return lengths [...] of vectors [..., dim], without an infinite derivative at length 0."""
+    xp = array_namespace(vectors)
+    squared = xp.sum(vectors * vectors, axis=-1)
+    return xp.where(squared > 0, xp.sqrt(xp.where(squared > 0, squared, xp.ones_like(squared))), xp.zeros_like(squared))
 
 
 def is_covered(pos: np.ndarray, normal: np.ndarray, shapes: tuple[Shape, ...], images: tuple[Shape, ...]) -> np.ndarray:

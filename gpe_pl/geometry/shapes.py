@@ -398,10 +398,10 @@ class DistanceGrid:
         return self.spacing * (max(self.counts) - 1)
 
     def signed_distance(self, points: Array) -> Array:
-        return self._interpolate(points)[0]
+        return self.interpolated(points)[0]
 
-    def _interpolate(self, points: Array) -> tuple[Array, Array]:
-        """Return interpolated distance [...] in m and its gradient [..., dim]."""
+    def interpolated(self, points: Array) -> tuple[Array, Array]:
+        """Return interpolated signed distances [...] of points [..., dim] in m and their gradients [..., dim]."""
         xp = array_namespace(points)
         dim, values = len(self.counts), _like(self.values.ravel(), points)
         place = (points - _like(self.origin, points)) / self.spacing
@@ -429,7 +429,7 @@ class DistanceGrid:
         points = self._surface(spacing)
         if len(points) == 0:
             return points, points.copy()
-        gradient = self._interpolate(points)[1]
+        gradient = self.interpolated(points)[1]
         # In 2D, half of the spacing limits the gaps. In 3D, 0.8 gives the density of a square lattice and a fifth more.
         keep = _thin(points, gradient / np.maximum(_norm(gradient), 1e-9)[:, None], (0.5 if len(self.counts) == 2 else 0.8) * spacing)
         return points[keep], np.asarray(outward_normal(self, points[keep], 0.5 * min(spacing, self.spacing)))
@@ -453,11 +453,11 @@ class DistanceGrid:
         chunk = max(1, 2**20 // len(inner))
         for start in range(0, len(cells), chunk):
             points = low + self.spacing * (cells[start : start + chunk, None] + inner).reshape(-1, dim)
-            distance, gradient = self._interpolate(points)
+            distance, gradient = self.interpolated(points)
             steepness = np.maximum(_norm(gradient), 0.1)
             points = points[np.abs(distance) <= 0.5 * math.sqrt(dim) * self.spacing / parts * steepness]
             for _ in range(5):  # Newton's method along the gradient
-                distance, gradient = self._interpolate(points)
+                distance, gradient = self.interpolated(points)
                 points = np.clip(points - gradient * (distance / np.maximum(_norm(gradient) ** 2, 0.01))[:, None], low, high)
             found.append(points[np.abs(self.signed_distance(points)) < 0.01 * spacing])
         return np.concatenate(found)

@@ -191,6 +191,24 @@ def test_an_obstacle_across_a_seam_has_its_other_part_on_the_other_side(shape: S
     np.testing.assert_allclose(moved(here, by).signed_distance(points + by), here.signed_distance(points), atol=1e-9)
 
 
+@pytest.mark.parametrize("center", [(0.9, 0.2), (0.5, 0.2), (0.98, 0.2)])
+def test_a_grid_over_the_domain_has_the_distances_of_its_solid(center: tuple[float, float]) -> None:
+    """The centre of the grid is not that of the solid. The solid may end beyond the last nodes, or be stored at both seams."""
+    space = Periodicity(((0.0, 1.0), (0.0, 0.4)), (True, False))
+    ball, axes = Sphere(center, 0.08, 0.3), [-0.01 + 0.01 * np.arange(103), -0.01 + 0.01 * np.arange(43)]
+    (exact,), nodes = repeated((ball,), space), np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    points = np.random.default_rng(0).uniform((0.0, 0.0), (1.0, 0.4), (4000, 2))
+    for solid in (ball, exact):
+        (grid,) = repeated((DistanceGrid.from_values((-0.01, -0.01), 0.01, solid.signed_distance(nodes), 0.3),), space)
+        found, true = grid.signed_distance(points), exact.signed_distance(points)
+        assert (found > true - 2e-3).all(), "nothing is solid that is free"
+        if center[0] < 0.98 or solid is exact:
+            assert (found < true + 2e-3 + 0.05 * np.maximum(true, 0.0)).all()
+        place = torch.tensor(points[:50], requires_grad=True)
+        grid.signed_distance(place).sum().backward()
+        assert place.grad is not None and torch.isfinite(place.grad).all()
+
+
 def test_a_container_across_a_seam_is_open_on_both_sides() -> None:
     (bowl,) = repeated((Bowl((0.15, 0.2), 0.15, 0.3),), CHANNEL)
     assert bowl.signed_distance(np.array([[0.2, 0.2], [0.85, 0.2]])).min() > 0
