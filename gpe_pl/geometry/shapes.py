@@ -426,7 +426,7 @@ class DistanceGrid:
 
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
         """Return nodes on the part of the surface inside the grid. Every point of this part has a node within ``spacing`` [m]."""
-        points = self._surface(spacing)
+        points = self.surface_points(spacing)
         if len(points) == 0:
             return points, points.copy()
         gradient = self.interpolated(points)[1]
@@ -434,7 +434,7 @@ class DistanceGrid:
         keep = _thin(points, gradient / np.maximum(_norm(gradient), 1e-9)[:, None], (0.5 if len(self.counts) == 2 else 0.8) * spacing)
         return points[keep], np.asarray(outward_normal(self, points[keep], 0.5 * min(spacing, self.spacing)))
 
-    def _surface(self, spacing: float) -> np.ndarray:
+    def surface_points(self, spacing: float) -> np.ndarray:
         """Return points [point, dim] on the surface, at most about one grid cell and about a third of ``spacing`` apart."""
         dim = len(self.counts)
         corners = [
@@ -512,39 +512,6 @@ def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:
 def surface_tolerance(shapes: tuple[Shape, ...]) -> float:
     """Return the distance [m] below which a point counts as on a surface: ``ON_SURFACE`` times the largest shape's extent, so that units do not matter."""
     return ON_SURFACE * packed_shapes(shapes).extent
-
-
-def thickness(shape: Shape) -> float:
-    """Return the smallest thickness of a shape [m].
-
-    It is the diameter of a sphere and the shortest side of a box. In a polygon it is the shortest way through it from the middle of an edge along the inward
-    normal. It is infinite for all other shapes.
-    """
-    if isinstance(shape, Sphere):
-        return 2.0 * shape.radius
-    if isinstance(shape, Box):
-        return min(high - low for low, high in zip(shape.low, shape.high, strict=True))
-    if not isinstance(shape, Polygon):
-        return math.inf
-    vertices = np.array(shape.vertices, dtype=np.float64)
-    before, after = vertices - np.roll(vertices, 1, axis=0), np.roll(vertices, -1, axis=0) - vertices
-    turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-    straight = np.abs(turn) <= 1e-9 * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
-    a = vertices[~straight]  # a vertex on a straight line does not divide an edge
-    edge = np.roll(a, -1, axis=0) - a
-    tangent = edge / np.linalg.norm(edge, axis=1)[:, None]
-    thinnest = math.inf
-    for k, middle in enumerate(a + edge / 2):
-        inward = np.array([-tangent[k, 1], tangent[k, 0]])
-        # Coordinates of all vertices in the frame of this edge: along it and into the polygon.
-        along, depth = (a - middle) @ tangent[k], (a - middle) @ inward
-        for j in range(len(a)):
-            n = (j + 1) % len(a)
-            if j != k and along[j] != along[n] and min(along[j], along[n]) <= 0.0 <= max(along[j], along[n]):
-                hit = depth[j] + (depth[n] - depth[j]) * along[j] / (along[j] - along[n])
-                if hit > 0.0:
-                    thinnest = min(thinnest, float(hit))
-    return thinnest
 
 
 def outward_normal(shape: Shape, points: Array, step: float) -> Array:

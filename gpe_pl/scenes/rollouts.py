@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from gpe_pl.data.ground_truth import solver_settings
-from gpe_pl.geometry.shapes import thickness
+from gpe_pl.geometry.thin_parts import thickness
 from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.training_ranges import stored_ranges

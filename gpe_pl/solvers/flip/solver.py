@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
 
-from gpe_pl.geometry.shapes import Wall, check_whole_cells, domain_walls, outward_normal, signed_distance, thickness
+from gpe_pl.geometry.shapes import Wall, check_whole_cells, domain_walls, outward_normal, signed_distance
+from gpe_pl.geometry.thin_parts import thickness
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import NODE_TYPES, node_code
 from gpe_pl.solvers.flip import islands, pressure, transfer, viscosity

@@ -14,7 +14,8 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numba import njit
 
-from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, Wall, outward_normal, signed_distance, thickness
+from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, Wall, outward_normal, signed_distance
+from gpe_pl.geometry.thin_parts import thickness
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import STICKY
 

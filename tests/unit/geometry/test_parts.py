@@ -7,7 +7,8 @@ import pytest
 
 from gpe_pl.geometry.grid_distance import is_oriented, mesh_distances
 from gpe_pl.geometry.sections import section, solid_within
-from gpe_pl.geometry.thin_parts import thinnest
+from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Polygon, Shape, Sphere
+from gpe_pl.geometry.thin_parts import thickness, thinnest
 
 FACES = np.array(
     [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4], [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6], [1, 3, 5], [3, 7, 5]]
@@ -72,3 +73,40 @@ def test_the_thickness_is_that_of_the_thinnest_part(turned: bool) -> None:
     cube, plate = box(0.2, 0.6), box(0.2, 0.6) * np.array([1.0, 1.0, 0.02])
     faces = cube[:, ::-1] if turned else cube
     assert thinnest(faces)[0] == pytest.approx(0.4) and thinnest(plate)[0] == pytest.approx(0.008)
+
+
+STEP = 0.01
+
+
+def gridded(shape: Shape, shift: float) -> DistanceGrid:
+    """Return a 2D solid as distances at the nodes of a grid around the unit square, moved by part of a cell."""
+    axis = (shift - 5) * STEP + STEP * np.arange(112)
+    return DistanceGrid.from_values(
+        axis[[0, 0]], STEP, shape.signed_distance(np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)), 0.3
+    )
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3, 0.5, 0.77])
+def test_the_thickness_of_a_grid_of_distances_is_that_of_its_solid(shift: float) -> None:
+    slab = Polygon(((0.2, 0.2), (0.23, 0.16), (0.83, 0.61), (0.8, 0.65)), 0.3)
+    table = Polygon(((0.1, 0.0), (0.3, 0.0), (0.3, 0.46), (0.9, 0.46), (0.9, 0.5), (0.1, 0.5)), 0.3)
+    for shape, true in ((Box((0.1, 0.3), (0.9, 0.325), 0.3), 0.025), (slab, 0.05), (table, 0.04), (Sphere((0.5, 0.5), 0.06, 0.3), 0.12)):
+        assert thickness(gridded(shape, shift)) == pytest.approx(true, abs=0.1 * STEP)
+    assert thickness(gridded(Box((0.1, 0.2), (0.9, 0.7), 0.3), shift)) == pytest.approx(0.5, abs=0.1 * STEP)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3, 0.5, 0.77])
+def test_tips_of_wedges_and_solids_that_fill_the_grid_are_not_thin(shift: float) -> None:
+    ramp, spike = Polygon(((0.1, 0.2), (0.9, 0.2), (0.9, 0.4)), 0.3), Polygon(((0.4, 0.2), (0.6, 0.2), (0.5, 0.6)), 0.3)
+    ground = Polygon(((-1.0, -1.0), (2.0, -1.0), (2.0, 0.1), (0.6, 0.4), (0.5, 0.15), (-1.0, 0.3)), 0.3)
+    for shape in (ramp, spike, ground, Bowl((0.5, 0.5), 0.45, 0.3)):
+        assert thickness(gridded(shape, shift)) > 0.15
+
+
+def test_the_neck_of_a_polygon_counts() -> None:
+    hourglass = Polygon(((0.1, 0.2), (0.9, 0.2), (0.505, 0.3), (0.9, 0.4), (0.1, 0.4), (0.495, 0.3)), 0.3)
+    notch = Polygon(((0.1, 0.2), (0.65, 0.2), (0.7, 0.37), (0.75, 0.2), (0.9, 0.2), (0.9, 0.4), (0.1, 0.4)), 0.3)
+    assert thickness(hourglass) == pytest.approx(0.01) and thickness(notch) == pytest.approx(0.03)
+    angle, count = np.linspace(0, 2 * np.pi, 60, endpoint=False), 3
+    clover = 0.5 + 0.3 * (1 + 0.3 * np.cos(count * angle))[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert thickness(Polygon(tuple(map(tuple, clover.tolist())), 0.3)) > 0.3

@@ -382,6 +382,16 @@ def test_the_solver_says_that_an_obstacle_is_thin(caplog: pytest.LogCaptureFixtu
     assert "cells of the grid" not in caplog.text
 
 
+def test_the_solver_says_that_a_mesh_is_thin(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    for name, extents in (("plate", (0.4, 0.2, 0.024)), ("block", (0.4, 0.2, 0.2))):
+        trimesh.creation.box(extents=extents).export(tmp_path / f"{name}.stl")
+    column().obstacle(mesh=tmp_path / "block.stl", at=(0.5, 0.3)).solve(seconds=0.01)
+    assert "cells of the grid" not in caplog.text
+    column().obstacle(mesh=tmp_path / "plate.stl", at=(0.5, 0.3)).solve(seconds=0.01)
+    assert "an obstacle (distance_grid) is 1.5 cells of the grid thick" in caplog.text
+
+
 def test_a_body_outside_the_box_is_drawn_in_red(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gpe_pl.viz.browser.open_page", lambda path: True)
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Polygon, Shape, Sphere, domain_walls, outward_normal, signed_distance
+from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import STICKY
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.mpm.collider import collider, push_out
@@ -164,3 +165,16 @@ def test_walls_hold_only_inward():
     state = block((0.4, 0.0), (6 * spacing, 3 * spacing), spacing, velocity=(0.0, 1.0), boundary=boundary, jitter=0.0)
     after = MPM(bounds=BOUNDS, grid_spacing=2 * spacing).step(state)
     np.testing.assert_allclose(after.vel, state.vel, atol=1e-12)
+
+
+def test_a_grid_of_distances_thinner_than_a_cell_is_refused():
+    axis = -0.25 + 0.025 * np.arange(61)
+    nodes = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+
+    def plate(thickness):
+        solid = Box((0.2, 0.37), (0.8, 0.37 + thickness), 0.3)
+        return DistanceGrid.from_values((-0.25, -0.25), 0.025, solid.signed_distance(nodes), 0.3)
+
+    with pytest.raises(SimulationError, match=r"DistanceGrid.* is 0.06.* m thin; .* must be at least 0.1 m thick"):
+        collider((plate(0.06),), (0.0, 0.0), 0.1, (11, 11))
+    collider((plate(0.1),), (0.0, 0.0), 0.1, (11, 11))
