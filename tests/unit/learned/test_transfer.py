@@ -30,7 +30,7 @@ from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata
 from tests import scenes
 
-LAW = {"elastic": True, "body_layer": 1.0, "decoder": "contact", "only_contacts": True}
+LAW: dict[str, Any] = {"elastic": True, "body_layer": 1.0, "decoder": "contact", "only_contacts": True}
 """Settings of GPE with the elastic law, for graphs of ``CELLS``."""
 CELLS = GraphConfig(history=1, islands=True, mesh=True, cells=True)
 E, NU = "youngs_modulus", "poisson_ratio"
@@ -215,7 +215,7 @@ def test_the_elastic_law_stays_the_same_in_pascal(before: Metadata, now: Metadat
     with torch.no_grad():
         for name, parameter in trained.model.named_parameters():
             if "logarithm" in name:
-                parameter += 0.1 * torch.randn_like(parameter)
+                parameter.add_(0.1 * torch.randn_like(parameter))
     new = simulator(now, 1, CELLS, **LAW)
     new.start_from(trained)
     for young in (5.0, 20.0):
@@ -261,7 +261,7 @@ def test_ranges_of_scales_cover_both_trainings(model: type[Model], scales: Liter
 
 
 @pytest.mark.parametrize("change", [{"frame_dt": 0.01}, {"spacing": 0.1}])
-def test_several_scales_relative_to_others_are_refused(change: dict[str, float]) -> None:
+def test_several_scales_relative_to_others_are_refused(change: dict[str, Any]) -> None:
     config, other = GraphConfig(history=1, islands=True, scales="dimensionless"), replace(SAND, **change)
     here = f"{other.spacing:g} m and {other.frame_dt:g} s"
     message = rf"spacing=0.05 m and frame_dt=0.005 s \(graph.scales=dimensionless\), those of the new one to {here}; .*gpe_pl.evaluate"

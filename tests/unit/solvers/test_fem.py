@@ -262,7 +262,7 @@ def test_a_thin_plate_holds_in_a_large_box_as_a_grid_of_distances_too():
         state = run(replace(fem, bounds=((0.0, 8.0), (0.0, 1.0))), state, 60)
         assert plate.signed_distance(state.pos).min() > -1e-4
         ends.append(state.pos)
-    np.testing.assert_allclose(*ends, atol=1e-3)
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-3)
 
 
 # --- what is refused ------------------------------------------------------------------------------------------------------------------------
