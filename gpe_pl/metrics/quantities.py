@@ -103,13 +103,11 @@ def _of_open_scene(trajectory: Trajectory) -> dict[str, Quantity]:
 def _has_a_middle(trajectory: Trajectory, up: Float[np.ndarray, "dim"]) -> bool:
     """Whether the first frame is narrower than half of the domain along each periodic axis that has a horizontal part. Otherwise it has no centre of mass."""
     space = trajectory.metadata.periodicity
-    if space is None or not trajectory.num_nodes:
-        return True
-    for axis in space.axes:
+    for axis in space.axes if trajectory.num_nodes else ():
         period = float(space.period[axis])
-        sorted_pos = np.sort(trajectory.pos[0, :, axis].astype(np.float64) % period)
-        widest_gap = max(float(np.diff(sorted_pos, append=sorted_pos[0] + period).max()), 0.0)
-        if abs(up[axis]) < 1 - 1e-9 and period - widest_gap >= 0.5 * period:
+        place = np.sort(trajectory.pos[0, :, axis].astype(np.float64) % period)
+        widest_gap = np.diff(place, append=place[0] + period).max()
+        if abs(up[axis]) < 1 - 1e-9 and widest_gap <= 0.5 * period:
             return False
     return True
 

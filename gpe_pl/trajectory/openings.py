@@ -152,7 +152,7 @@ class Opening:
             limit = self.depth
         elif self.enters and self._num_layers(end) < self._num_layers(start):
             limit = self._depth_of_layer(-self._num_layers(end), end) - self.spacing / 2
-        has_passed = (depth >= -self.depth) & (self._way_from_face(before) >= 0)
+        has_passed = (depth >= -self.depth) & (self._way_from_face(before) >= -ON_FACE * self.depth)
         return np.asarray(((depth >= 0) | has_passed) & (depth < limit))
 
     @property
