@@ -37,7 +37,9 @@ def united(shapes: Mapping[str, Shape], spacing: float) -> tuple[Shape, ...]:
     for one, other in combinations(shapes, 2):
         if group[one] != group[other] and _touch(shapes[one], shapes[other], spacing):
             log.warning(
-                "%s and %s touch or overlap: what slides across the face between them can catch on it; draw them as one polygon", one, other
+                "%s and %s touch or overlap: what slides across the face between them can catch on it; one obstacle in their place has none",
+                one,
+                other,
             )
     return tuple(found[name] for name in shapes if group[name] == name)
 
