@@ -132,7 +132,7 @@ def _warn_of_mass(body: Body, nodes: Nodes, density: float, spacing: float) -> N
     ratio = float(nodes.mass.sum()) / (density * _volume(body, spacing))
     if abs(ratio - 1) > MASS_TOLERANCE:
         log.warning(
-            "%s: its nodes have %.2f times its mass, because few nodes %g m apart fit into it; make it larger or thicker",
+            "%s: its nodes have %.2f times its mass, because few nodes %g m apart fit into it; another size may fit better",
             body.name,
             ratio,
             spacing,

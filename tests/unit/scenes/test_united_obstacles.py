@@ -23,7 +23,7 @@ def test_tiles_of_a_floor_are_one_box(caplog: pytest.LogCaptureFixture) -> None:
     tiles = {f"tile {k}": Box((low, 0.0), (high, 0.3), 0.2, 0.1) for k, (low, high) in enumerate(pairwise(np.linspace(0, 1, 6).tolist()))}
     (floor,) = united(tiles, 0.05)
     assert isinstance(floor, Polygon) and len(floor.vertices) == 4 and (floor.friction, floor.restitution) == (0.2, 0.1)
-    np.testing.assert_allclose(distances([floor]), Box((0.0, 0.0), (1.0, 0.3), 0.2).signed_distance(POINTS), atol=1e-5)
+    np.testing.assert_allclose(distances([floor]), Box((0.0, 0.0), (1.0, 0.3), 0.2).signed_distance(POINTS), atol=1e-12)
     assert not caplog.records
 
 
@@ -39,8 +39,14 @@ def test_a_ramp_with_a_plateau_and_a_block_apart() -> None:
 
 @pytest.mark.parametrize(
     "other",
-    [Box((0.5, 0.0), (1.0, 0.3), 0.9), Sphere((0.5, 0.2), 0.15, 0.2), Sphere((0.25, 0.15), 0.05, 0.2)],
-    ids=["another friction", "disc", "disc inside"],
+    [
+        Box((0.5, 0.0), (1.0, 0.3), 0.9),
+        Sphere((0.5, 0.2), 0.15, 0.2),
+        Sphere((0.25, 0.15), 0.05, 0.2),
+        Box((0.48, 0.28), (0.8, 0.6), 0.2),
+        Box((0.47, 0.3), (0.8, 0.6), 0.2),
+    ],
+    ids=["another friction", "disc", "disc inside", "neck", "narrow face"],
 )
 def test_others_that_touch_are_named(other: Any, caplog: pytest.LogCaptureFixture) -> None:
     shapes = {"obstacle 1": Box((0.0, 0.0), (0.5, 0.3), 0.2), "obstacle 2": other, "obstacle 3": Sphere((0.9, 0.9), 0.05, 0.2)}
@@ -51,12 +57,43 @@ def test_others_that_touch_are_named(other: Any, caplog: pytest.LogCaptureFixtur
     )
 
 
-def test_a_ring_of_boxes_stays(caplog: pytest.LogCaptureFixture) -> None:
-    """A polygon has no hole."""
+def test_a_ring_of_boxes_is_open_on_one_side(caplog: pytest.LogCaptureFixture) -> None:
+    """A polygon has no hole, so three sides become one, and the last one stays."""
     sides = [((0.0, 0.0), (1.0, 0.1)), ((0.0, 0.9), (1.0, 1.0)), ((0.0, 0.1), (0.1, 0.9)), ((0.9, 0.1), (1.0, 0.9))]
     shapes = {str(k): Box(*corners, 0.2) for k, corners in enumerate(sides)}
+    found = united(shapes, 0.02)
+    assert len(found) == 2 and len(caplog.records) == 2
+    np.testing.assert_array_equal(distances(found) > 0, distances(shapes.values()) > 0)
+
+
+@pytest.mark.parametrize("other", [Box((0.5, 0.3), (0.8, 0.6), 0.2), Sphere((0.25, 0.35), 0.05, 0.2)], ids=["corner", "tangent disc"])
+def test_shapes_that_meet_in_a_point_have_no_face_between_them(other: Any, caplog: pytest.LogCaptureFixture) -> None:
+    shapes = {"obstacle 1": Box((0.0, 0.0), (0.5, 0.3), 0.2), "obstacle 2": other}
     assert united(shapes, 0.02) == tuple(shapes.values())
-    assert len(caplog.records) == 4
+    assert not caplog.records
+
+
+def test_sizes_do_not_matter_for_corners() -> None:
+    """Corners of small shapes stay where they are beside a floor that is far larger, and a slit of rounding is closed."""
+    floor = Box((-1e4, -1.0), (1e4, 0.0), 0.2)
+    left, right = Box((0.30003, 0.0), (0.40007, 0.20003), 0.2), Box((0.40007 + 1e-9, 0.0), (0.5, 0.20003), 0.2)
+    (found,) = united({"left": left, "floor": floor, "right": right}, 1.0)
+    assert isinstance(found, Polygon)
+    assert {(0.30003, 0.20003), (0.5, 0.20003), (1e4, 0.0)} <= {*found.vertices} and len(found.vertices) == 8
+
+
+def test_many_small_tiles_in_any_order() -> None:
+    lows = np.random.default_rng(0).permutation(60) / 60
+    tiles = {f"{low}": Box((float(low), 0.0), (float(low) + 1 / 60, 0.1), 0.2) for low in lows}
+    (floor,) = united(tiles, 0.01)
+    assert isinstance(floor, Polygon) and len(floor.vertices) == 4
+
+
+@pytest.mark.slow
+def test_a_stair_of_thick_boxes_is_solved() -> None:
+    scene = Scene(box=(1.0, 1.0)).block("sand", (0.05, 0.6), (0.15, 0.15)).obstacle(Box((0.0, 0.0), (0.3, 0.2), 0.3))
+    for corner in ((0.29, 0.19), (0.295, 0.2), (0.2, 0.2)):
+        assert scene.obstacle(Box(corner, (0.6, 0.4), 0.3)).solve(0.02).first.termination is None
 
 
 def test_three_dimensional_boxes_stay(caplog: pytest.LogCaptureFixture) -> None:
