@@ -120,12 +120,16 @@ class FitRun:
             NoiseError: the noise is too large for the spacing of the scenes.
             CheckpointError: the model of ``start_from`` has other settings.
             StartError: ``evaluation.start_time`` leaves too little history, or is between frames.
-            ConfigError: evaluated data have frames of another length.
+            ConfigError: evaluated data have frames of another length, or windows of the elastic law are to be turned by any angle.
         """
         scenes, evaluated = scene_metadata(self.parts[0], "train"), evaluated_config(self.cfg)
         self.training.noise.check(scenes)
         builder = GraphBuilder(self.graph, scenes)
         untrained = LearnedSimulator(self.new_model(spec=builder.spec), builder, self.stride)
+        if self.training.rotate and untrained.model.settings.get("elastic"):
+            raise ConfigError(
+                "training.rotate=true: the elastic law reads the shapes of walls, which turn by whole quarters only; choose training.quarter_turns=true"
+            )
         if self.start is not None:
             check_model(untrained, self.start)
             stride = self.start.stride_on(scene_metadata(self.cfg, "train", strided=False))

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from torch_geometric.data import HeteroData
 
-from gpe_pl.data.augmentation import Augmentation, AugmentationError
+from gpe_pl.data.augmentation import Augmentation
 from gpe_pl.data.damage import damage
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.open_windows import check_settings, continued
@@ -312,10 +312,6 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
     ) -> None:
         self.trajectories, self.builder, self.noise, self.stress, self.solver = trajectories, builder, noise, stress, solver
         self.augmentation, self.unroll_steps = augmentation, unroll_steps
-        if augmentation.rotate and builder.config.cells:
-            raise AugmentationError(
-                "training.rotate=true: the elastic law reads the shapes of walls, which turn by whole quarters only; choose training.quarter_turns=true"
-            )
         if augmentation.is_beyond_mirror:
             for stored in trajectories:
                 augmentation.check(stored.window(0, 1))

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.data.augmentation import Augmentation, AugmentationError, boosted, turned_with_gravity
 from gpe_pl.data.dataset import StartKey, StoredTrajectory, WindowDataset
+from gpe_pl.fit import fit
 from gpe_pl.geometry.shapes import Box, Wall, domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
@@ -19,6 +21,7 @@ from gpe_pl.training.run import TrainingSettings
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.reflection import Rotation
 from gpe_pl.trajectory.trajectory import Trajectory
+from tests.runs import tiny
 
 DT, HISTORY = 0.01, 2
 
@@ -127,12 +130,9 @@ def test_every_direction_of_gravity_is_drawn_alike() -> None:
     assert len(counts) == 4 and min(counts.values()) > 70
 
 
-def test_windows_of_the_elastic_law_are_not_turned_by_any_angle(truth: Trajectory) -> None:
-    stored = StoredTrajectory(Path("shard"), "0", truth.num_frames, truth.num_nodes, truth)
-    builder = GraphBuilder(GraphConfig(history=HISTORY), truth.metadata)
-    builder = replace(builder, config=replace(builder.config, cells=True))
-    with pytest.raises(AugmentationError, match=r"training.rotate=true: the elastic law reads the shapes of walls"):
-        WindowDataset([stored], builder, augmentation=Augmentation(rotate=True))
+def test_windows_of_the_elastic_law_are_not_turned_by_any_angle(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"training.rotate=true: the elastic law reads the shapes of walls"):
+        fit(tiny(tmp_path, tmp_path, "data=fem", "model=gpe_tuned", "training.rotate=true"))
 
 
 @pytest.mark.parametrize("number", range(1, 24))
