@@ -51,11 +51,10 @@ def _too_fast(trajectory: Trajectory, stride: int) -> str | None:
     space = trajectory.metadata.periodicity
     if stride == 1 or not space or trajectory.num_frames <= stride:
         return None
+    way = np.zeros(trajectory.pos.shape)
+    np.cumsum(space.shortest(np.diff(trajectory.pos.astype(np.float64), axis=0)), axis=0, out=way[1:])
     for axis in space.axes:
-        step = np.zeros((trajectory.num_frames, trajectory.num_nodes))
-        step[1:] = space.shortest(np.diff(trajectory.pos.astype(np.float64), axis=0))[..., axis]
-        way = np.cumsum(step, axis=0)
-        fast = np.abs(way[stride:] - way[:-stride]) >= 0.5 * space.period[axis]
+        fast = np.abs(way[stride:, :, axis] - way[:-stride, :, axis]) >= 0.5 * space.period[axis]
         if fast.any():
             frame, node = np.argwhere(fast)[0]
             period = f"the period of {space.period[axis]:.3g} m along {'xyz'[axis]}"

@@ -31,6 +31,8 @@ def united(shapes: Mapping[str, Shape], spacing: float) -> tuple[Shape, ...]:
         shapes: obstacles by name.
         spacing: distance of nodes [m].
     """
+    if len(shapes) < 2:
+        return tuple(shapes.values())
     group, found = {name: name for name in shapes}, dict(shapes)
     for kind in dict.fromkeys(filter(None, map(_kind, shapes.values()))):
         rest = {name: _outline(shape) for name, shape in shapes.items() if _kind(shape) == kind}

@@ -14,6 +14,8 @@ from functools import lru_cache
 import numpy as np
 
 from gpe_pl.geometry.shapes import Shape, signed_distance
+from gpe_pl.geometry.thin_parts import thickness
+from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.solvers.flip import transfer
 
 PADDING = 3
@@ -94,7 +96,15 @@ def make_grid(bounds: tuple[tuple[float, float], ...], spacing: float) -> Grid:
 
 @lru_cache(maxsize=4)
 def make_solids(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...], spacing: float) -> Solids:
-    """Return the space that shapes leave open on the grid of a domain."""
+    """Return the space that shapes leave open on the grid of a domain.
+
+    Raises:
+        SimulationError: with reason ``input``, if an obstacle is thinner than a cell.
+    """
+    for shape in shapes:
+        if (thin := thickness(shape)) < spacing * (1 - 1e-6):
+            message = f"obstacle {shape} is {thin:g} m thin; on a grid of spacing {spacing:g} m it must be at least that thick"
+            raise SimulationError(message, reason="input")
     grid = make_grid(bounds, spacing)
     dim, counts = grid.dim, grid.counts
     # there is one more layer of nodes than of cells, so that every cell has all its corners

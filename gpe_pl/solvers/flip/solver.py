@@ -11,7 +11,6 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
 
 from gpe_pl.geometry.shapes import Wall, check_whole_cells, domain_walls, outward_normal, signed_distance
-from gpe_pl.geometry.thin_parts import thickness
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import NODE_TYPES, node_code
 from gpe_pl.solvers.flip import islands, pressure, transfer, viscosity
@@ -320,17 +319,7 @@ class FLIP:
         return make_grid(self.bounds, self.grid_spacing)
 
     def solids(self, boundary: Boundary) -> Solids:
-        """Sample the boundary on the solver's grid.
-
-        Raises:
-            SimulationError: with reason ``input``, if an obstacle is thinner than a cell.
-        """
-        for shape in boundary.shapes:
-            if thickness(shape) < self.grid_spacing * (1 - 1e-6):
-                raise SimulationError(
-                    f"obstacle {shape} is {thickness(shape):g} m thin; on a grid of spacing {self.grid_spacing:g} m it must be at least that thick",
-                    reason="input",
-                )
+        """Sample the boundary on the solver's grid. Errors are those of ``make_solids``."""
         return make_solids(tuple(boundary.shapes), self.bounds, self.grid_spacing)
 
     def _advance(

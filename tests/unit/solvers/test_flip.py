@@ -13,6 +13,7 @@ from gpe_pl.geometry.shapes import Box, Sphere, domain_walls
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.flip import FLIP
+from gpe_pl.solvers.flip import grid as flip_grid
 from gpe_pl.solvers.flip.grid import PADDING, make_grid, make_solids
 from gpe_pl.solvers.flip.linear import conjugate_gradients, incomplete_cholesky
 from gpe_pl.solvers.flip.pressure import surface_distance
@@ -123,6 +124,21 @@ def test_walls_are_where_the_shapes_say(dim):
     raised = make_solids((Box((-9.0,) * dim, (9.0,) * (dim - 1) + (0.53125,), 0.0),), bounds, 1 / 8)
     cell = (PADDING,) * (dim - 1) + (PADDING + 4,)
     np.testing.assert_allclose(raised.area[0].reshape((8 + 2 * PADDING,) * dim)[cell], 0.75, atol=1e-12)
+
+
+def test_the_thickness_of_obstacles_is_measured_once(monkeypatch):
+    """The solver asks for the solids in every step."""
+    measured = []
+
+    def thickness(shape):
+        measured.append(shape)
+        return 1.0
+
+    monkeypatch.setattr(flip_grid, "thickness", thickness)
+    bounds = ((0.0, 1.0), (0.0, 1.1))
+    for _ in range(3):
+        make_solids((Sphere((0.5, 0.5), 0.2, 0.0),), bounds, 1 / 10)
+    assert len(measured) == 1
 
 
 @pytest.mark.parametrize("dim", [2, 3])
