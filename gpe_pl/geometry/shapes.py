@@ -515,7 +515,10 @@ def surface_tolerance(shapes: tuple[Shape, ...]) -> float:
 
 
 def outward_normal(shape: Shape, points: Array, step: float) -> Array:
-    """Return unit vectors [..., dim] into free space: gradients of the signed distance by central differences of ``step`` [m]; zero where undefined."""
+    """Return unit vectors [..., dim] into free space: gradients of the signed distance by central differences of ``step`` [m].
+
+    They are zero where the gradient vanishes up to rounding, as in the middle of a plate.
+    """
     xp = array_namespace(points)
     if isinstance(shape, Wall):
         return xp.zeros_like(points) + _like(shape.normal, points)
@@ -525,7 +528,8 @@ def outward_normal(shape: Shape, points: Array, step: float) -> Array:
         columns.append(shape.signed_distance(points + offset) - shape.signed_distance(points - offset))
     gradient = xp.stack(columns, axis=-1)
     length = _norm(gradient)
-    return gradient / xp.where(length > 0, length, xp.ones_like(length))[..., None]
+    is_known = length > 1e-6 * step
+    return xp.where(is_known[..., None], gradient / xp.where(is_known, length, xp.ones_like(length))[..., None], xp.zeros_like(gradient))
 
 
 def check_bounds(bounds: tuple[tuple[float, float], ...]) -> None:

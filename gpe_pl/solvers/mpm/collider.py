@@ -77,10 +77,10 @@ def collider(shapes: tuple[Shape, ...], origin: tuple[float, ...], spacing: floa
         if not isinstance(shape, Wall):
             _require_resolved(shape, mask, spacing, dim)
         normal = outward_normal(shape, nodes[mask], 1e-3 * spacing)
-        # deep inside a shape the normal is undefined, so the node sticks
-        friction = np.where(np.sum(normal * normal, axis=-1) > 0, shape.friction, STICKY)
-        at = row[mask]
-        conditions[at, filled[at]] = np.concatenate([normal, friction[:, None]], axis=-1)
+        # Where the normal is undefined, as in the middle of a plate, a node has no condition. It holds particles of both sides of a thin plate.
+        is_known = (normal != 0).any(axis=-1) | (shape.friction >= STICKY)
+        at = row[mask][is_known]
+        conditions[at, filled[at]] = np.column_stack([normal[is_known], np.full(len(at), shape.friction)])
         filled[at] += 1
         if isinstance(shape, Wall):
             planes.append([*shape.normal, shape.offset])

@@ -178,3 +178,22 @@ def test_a_grid_of_distances_thinner_than_a_cell_is_refused():
     with pytest.raises(SimulationError, match=r"DistanceGrid.* is 0.06.* m thin; .* must be at least 0.1 m thick"):
         collider((plate(0.06),), (0.0, 0.0), 0.1, (11, 11))
     collider((plate(0.1),), (0.0, 0.0), 0.1, (11, 11))
+
+
+@pytest.mark.parametrize("kind", [Box, Polygon])
+@pytest.mark.parametrize("material", ["elastomer", "snow", "sand", "fluid"])
+def test_a_block_slides_over_a_plate_of_two_cells(material, kind):
+    """Grid nodes in the middle of the plate feel the particles of both sides, and have no normal."""
+    top, thickness = 6 / 16, 2 / 16
+    low, high = (0.0, top - thickness), (1.0, top)
+    plate = Box(low, high, 0.0) if kind is Box else Polygon((low, (1.0, low[1]), high, (0.0, top)), 0.0)
+    solver = MPM(BOUNDS, 1 / CELLS, 0.01, materials=(material,))
+    state = block((0.2, top), (0.3, 0.2), 1 / 32, material, velocity=(1.0, 0.0), boundary=Boundary.sample((plate,), 1 / 32, 2))
+    after = run(solver, state, 15)
+    assert np.average(after.vel[:, 0], weights=after.mass) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_middle_of_a_plate_has_no_normal_whatever_the_rounding():
+    for height in 0.04 * np.arange(1, 9):
+        middle = np.array([[0.5, height]])
+        assert (outward_normal(Box((0.0, height - 0.04), (1.0, height + 0.04), 0.0), middle, 1e-3 * 0.04) == 0).all()
