@@ -183,7 +183,7 @@ class UnlikeScenes:
             return
         stop = min(len(spread) - 1, len(self.spread))
         for frame in sorted(sampled_frames(stop + 1) - {0}):
-            if spread[frame] > self.spread[frame - 1]:
+            if spread[frame] > (1 + MARGIN) * self.spread[frame - 1]:
                 yield (
                     "spread of the ensemble",
                     f"spread of the ensemble is {spread[frame]:.3g} m after {frame} frames, in {self.known} at most {self.spread[frame - 1]:.3g} m"

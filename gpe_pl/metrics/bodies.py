@@ -91,6 +91,13 @@ class Bodies:
         return np.stack([motion.rotation for motion in self.motions], axis=1)
 
     @cached_property
+    def has_rods(self) -> bool:
+        """Whether a body in 3D is straight at rest, so that its rotation about its own axis is arbitrary."""
+        t = self.trajectory
+        assert t.rest_pos is not None
+        return t.metadata.dim == 3 and any(_is_straight(t.rest_pos[own]) for own in self.nodes)
+
+    @cached_property
     def energy(self) -> Float[np.ndarray, "frame"] | None:
         """Elastic energy of all bodies [J]; None if it is not known."""
         return strain_energy(self.trajectory)
@@ -117,6 +124,12 @@ class Bodies:
         return None if stress is None else von_mises(np.asarray(stress.node, np.float64)[:, np.concatenate(self.nodes)])
 
 
+def _is_straight(pos: Float[np.ndarray, "node dim"]) -> bool:
+    """Tell whether nodes lie on one line, up to a millionth of its length."""
+    sizes = np.linalg.svd(pos.astype(np.float64) - pos.mean(axis=0, dtype=np.float64), compute_uv=False)
+    return bool(sizes[1:2].max(initial=0.0) <= 1e-6 * sizes[0])
+
+
 def body_metrics(prediction: Bodies, truth: Bodies, num_steps: int) -> dict[str, float]:
     """Compute the metrics of bodies over frames 1 to ``num_steps``.
 
@@ -133,7 +146,8 @@ def body_metrics(prediction: Bodies, truth: Bodies, num_steps: int) -> dict[str,
     ======================== ==== ======================================================================================================
 
     A metric is left out if the ground truth has nothing to compare with: no deformation above ``SMALLEST_DEFORMATION``, no bounce above ``SMALLEST_BOUNCE``,
-    no contact, no gravity, no stress, or no known Poisson's ratio. ``deformation`` and ``contact`` define deformation, energy and contact.
+    no contact, no gravity, no stress, or no known Poisson's ratio. Straight rods in 3D have no ``rotation_error`` and no ``deformation_error``, because a turn
+    about their axis does not show. ``deformation`` and ``contact`` define deformation, energy and contact.
 
     Args:
         prediction: bodies of a rollout, with finite positions in these frames.
@@ -141,11 +155,15 @@ def body_metrics(prediction: Bodies, truth: Bodies, num_steps: int) -> dict[str,
         num_steps: number of steps.
     """
     until, spacing = num_steps + 1, truth.trajectory.metadata.spacing
-    values = {"rotation_error": float(rotation_angle(prediction.rotation[1:until].swapaxes(-1, -2) @ truth.rotation[1:until]).mean())}
+    values = {}
+    if not truth.has_rods:
+        apart = prediction.rotation[1:until].swapaxes(-1, -2) @ truth.rotation[1:until]
+        values["rotation_error"] = float(rotation_angle(apart).mean())
     size = _norm(truth.field[1:until], truth.mass)
     if size > SMALLEST_DEFORMATION * spacing:
         values["deformation_ratio"] = _norm(prediction.field[1:until], truth.mass) / size
-        values["deformation_error"] = _norm(prediction.field[1:until] - truth.field[1:until], truth.mass) / size
+        if not truth.has_rods:
+            values["deformation_error"] = _norm(prediction.field[1:until] - truth.field[1:until], truth.mass) / size
         if truth.energy is not None and prediction.energy is not None:
             values["strain_energy_ratio"] = float(prediction.energy[1:until].mean() / truth.energy[1:until].mean())
     return values | _contact_metrics(prediction, truth, until) | _peak_stress(prediction, truth, until)

@@ -107,8 +107,10 @@ def equivariance_error(prediction: Trajectory, mirrored: Trajectory) -> float:
     """
     if prediction.num_frames != mirrored.num_frames:
         return math.inf
-    pos, other = (t.metadata.periodicity.shortest(t.pos.astype(np.float64) - prediction.pos[0]) for t in (prediction, mirrored))
-    return _relative(prediction.metadata.periodicity.shortest(pos - other), pos)
+    space = prediction.metadata.periodicity
+    pos, other = (t.pos.astype(np.float64) for t in (prediction, mirrored))
+    way = np.cumsum(space.shortest(np.diff(pos, axis=0)), axis=0)  # a node may have moved by more than half a period
+    return _relative(space.shortest(pos - other), way)
 
 
 def _relative(error: np.ndarray, reference: np.ndarray) -> float:

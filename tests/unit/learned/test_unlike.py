@@ -83,6 +83,7 @@ def test_a_warning_counts_scenes(caplog: pytest.LogCaptureFixture) -> None:
     assert scenes.add({"speed of sand [m/s]": (0.1, 2.1)}, narrow) == 0
     assert scenes.add({"speed of sand [m/s]": (0.1, 6.0)}, narrow) == 1
     assert scenes.add({"speed of sand [m/s]": (0.1, 9.0)}, wide) == 2
+    assert UnlikeScenes({}, "calibration scenes", is_complete=True, spread=[0.1, 0.2]).add({}, 1.2 * narrow) == 0, "within the margin"
     new = UnlikeScenes(scenes.limits, "calibration scenes", is_complete=True)
     assert new.add({"edges per node of sand": (3.0, 4.0)}) == 1, "calibration scenes have no such quantity"
     with caplog.at_level(logging.WARNING):

@@ -113,3 +113,24 @@ def test_rollouts_have_these_metrics_and_fail_in_all_of_them() -> None:
     records = {(r.metric, r.horizon): r.value for r in rollout_metrics(stopped, truth, (8, "full"))}
     assert records["deformation_ratio", 8] == pytest.approx(1)
     assert all(records[name, "full"] == math.inf for name in expected)
+
+
+def test_a_turn_of_a_straight_rod_about_its_axis_is_no_error() -> None:
+    """It does not show. Otherwise rounding would decide it."""
+    rest = np.column_stack([0.1 * np.arange(6), np.zeros((6, 2))])
+    bent = rest + 0.02 * np.sin(np.linspace(0, np.pi, 6))[:, None] * np.array([0.0, 1.0, 0.5])
+    pos = np.stack([rest, *(rest + amount * (bent - rest) for amount in (0.5, 1.0, 0.7))]) + 0.5
+    cells = {"line": np.column_stack([np.arange(5), np.arange(1, 6)])}
+
+    def rod(noise: float) -> Trajectory:
+        moved = pos + noise * np.random.default_rng(0).normal(size=pos.shape) * (np.arange(4) > 0)[:, None, None]
+        bounds = ((0.0, 2.0),) * 3
+        return Trajectory.from_numpy(
+            moved, DT, "elastomer", {"elastomer": 1e5}, bounds=bounds, spacing=0.1, cells=cells, rest_pos=rest + 0.5
+        )
+
+    truth = Bodies.of(rod(0.0))
+    assert truth is not None
+    found = body_metrics(truth.predicted(rod(1e-7)), truth, 3)
+    assert found["deformation_ratio"] == pytest.approx(1, abs=1e-4)
+    assert not {"rotation_error", "deformation_error"} & found.keys()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gpe_pl.metrics.liquids import UNITS, liquid_metrics
+from gpe_pl.metrics.liquids import UNITS, liquid_metrics, volume
 from gpe_pl.metrics.rollouts import rollout_metrics
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
@@ -72,3 +72,13 @@ def test_rollouts_of_liquids_have_them_and_others_do_not() -> None:
     assert not {*UNITS} & {r.metric for r in rollout_metrics(dry, dry, [2])}
     broken = replace(wet, pos=np.where(np.arange(4)[:, None, None] > 1, np.nan, wet.pos))
     assert all(np.isinf(r.value) for r in rollout_metrics(broken, wet, [2]) if r.metric in UNITS)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_moves_of_the_whole_liquid_by_parts_of_a_spacing_leave_its_volume(dim: int) -> None:
+    axes = np.meshgrid(*[np.arange(20), np.arange(8), np.arange(8)][:dim], indexing="ij")
+    pool = SPACING * (0.5 + np.stack(axes, axis=-1).reshape(-1, dim))
+    pool = pool + np.random.default_rng(0).uniform(-0.25, 0.25, pool.shape) * SPACING
+    metadata = replace(METADATA, bounds=((0.0, 3.0),) * dim, gravity=(0.0,) * (dim - 1) + (-9.81,))
+    found = [volume(pool + shift * SPACING, metadata) for shift in (0.0, 0.1, 0.25, 0.4, 0.5, 0.7)]
+    assert np.ptp(found) < 0.02 * np.mean(found)

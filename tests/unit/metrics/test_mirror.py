@@ -192,3 +192,12 @@ def _moved(trajectory: Trajectory) -> float:
 def test_a_rollout_that_stops_on_one_side_only_is_infinitely_wrong() -> None:
     one = rolled_out(ConstantVelocity(DT))
     assert equivariance_error(one, one.frames(0, 3)) == math.inf
+
+
+def test_the_way_of_a_node_around_a_periodic_domain_is_not_folded() -> None:
+    way = np.array([0.2, 0.0]) * np.arange(6)[:, None, None] + np.array([[0.1, 0.5], [0.15, 0.5]])
+    one, other = (
+        Trajectory.from_numpy(pos, DT, "sand", {"sand": 30.0}, bounds=((0.0, 1.0), (0.0, 1.0)), periodic=(True, False), spacing=0.05)
+        for pos in (way, way + 0.001 * np.arange(6)[:, None, None] * np.array([0.0, 1.0]))
+    )
+    assert equivariance_error(one, other) == pytest.approx(0.001 / 0.2, rel=1e-3)
