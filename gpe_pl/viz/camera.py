@@ -7,12 +7,13 @@ from jaxtyping import Float
 
 from gpe_pl.geometry.shapes import Bowl
 from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.viz.captions import SHOWN_OUTSIDE
 
 ELEVATION, AZIMUTH = math.radians(24), math.radians(-60)
 """Direction from a 3D scene to the viewer: angle above the ground, and angle around the vertical."""
 
 MARGIN = 0.015
-"""Margin for the lines of walls, as a fraction of the longer side."""
+"""Smallest margin, for the lines of walls, as a fraction of the longer side."""
 
 
 def vertical_axis(trajectory: Trajectory) -> int:
@@ -49,9 +50,7 @@ class Camera:
             if isinstance(shape, Bowl):  # everything happens inside the bowl
                 center, _ = self.project(np.asarray(shape.center, float))
                 low, high = np.maximum(low, center - shape.radius), np.minimum(high, center + shape.radius)
-        margin = MARGIN * (high - low).max()
-        if trajectory.metadata.periodicity:  # particles reach the edge
-            margin = max(margin, 0.5 * trajectory.metadata.spacing)
+        margin = max(MARGIN * (high - low).max(), SHOWN_OUTSIDE * trajectory.metadata.spacing)
         self.low, self.high = low - margin, high + margin
         self._depth_range = float(depth.min()), float(depth.max())
 

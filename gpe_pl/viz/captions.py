@@ -14,6 +14,10 @@ PREFIXES = (("G", 1e9), ("M", 1e6), ("k", 1e3))
 """Prefixes of pascals and their factors."""
 
 
+SHOWN_OUTSIDE = 0.5
+"""Distance outside the domain up to which pictures show a node [rest spacings]."""
+
+
 def heading(trajectory: Trajectory) -> str:
     """Return the words ``prediction`` or ``ground truth`` for a trajectory."""
     return "prediction" if trajectory.is_prediction else "ground truth"
@@ -47,10 +51,16 @@ def pictured(first: Trajectory, others: Mapping[str, Trajectory]) -> dict[str, T
     return {name: t.with_nodes_of(first).with_moving_boundary().with_absent_hidden() for name, t in named.items()}
 
 
+def as_written(text: str) -> str:
+    """Return a text that Matplotlib shows as it is: not as mathematics between dollar signs, and in legends also if it begins with an underscore."""
+    escaped = text.replace("$", r"\$")
+    return f"\u200b{escaped}" if escaped.startswith("_") else escaped  # a space without width
+
+
 def hidden_nodes(trajectory: Trajectory, frame: int) -> list[str]:
     """Return how many nodes a picture of a frame does not show: ``20 of 48 nodes are outside``, ``3 of 48 nodes are missing``; empty if it shows all.
 
-    A node is outside if it is farther outside the domain than a rest spacing, and missing if its position is not finite. Moving walls do not count, nor do
+    A node is outside if it is farther outside the domain than ``SHOWN_OUTSIDE``, and missing if its position is not finite. Moving walls do not count, nor do
     nodes that are not in an open scene in this frame.
     """
     metadata = trajectory.metadata
@@ -60,7 +70,8 @@ def hidden_nodes(trajectory: Trajectory, frame: int) -> list[str]:
     pos = metadata.periodicity.wrapped(trajectory.pos[frame, counted].astype(np.float64))
     low, high = np.asarray(metadata.bounds, float).T
     missing = ~np.isfinite(pos).all(axis=1)
-    outside = ((pos < low - metadata.spacing) | (pos > high + metadata.spacing)).any(axis=1) & ~missing
+    margin = SHOWN_OUTSIDE * metadata.spacing
+    outside = ((pos < low - margin) | (pos > high + margin)).any(axis=1) & ~missing
     return [f"{mask.sum()} of {len(pos)} nodes are {what}" for mask, what in ((outside, "outside"), (missing, "missing")) if mask.any()]
 
 

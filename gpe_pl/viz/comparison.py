@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from gpe_pl.metrics import Interval
+from gpe_pl.viz.captions import as_written
 from gpe_pl.viz.coloring import PALETTE, curve_styles
 from gpe_pl.viz.film_strip import TEXT_WIDTH, new_figure
 
@@ -38,7 +39,7 @@ def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], reference
         finite, open_end = np.isfinite(middle), np.isfinite(middle) & ~np.isfinite(high)
         ends = np.stack([low, np.where(open_end, middle, high)])[:, finite]
         axes.errorbar(
-            x[finite], middle[finite], np.abs(ends - middle[finite]), fmt="o", markersize=4, linewidth=1, capsize=2, color=color, label=model
+            x[finite], middle[finite], np.abs(ends - middle[finite]), fmt="o", markersize=4, linewidth=1, capsize=2, color=color, label=as_written(model)
         )  # fmt: skip
         top = axes.get_xaxis_transform()
         for place, value in zip(x[open_end], middle[open_end], strict=True):
@@ -100,7 +101,7 @@ def parameter_figure(
                 linewidth=0.8,
                 zorder=3 - 0.1 * k,  # the first model is not hidden
                 color=color,
-                label=model,
+                label=as_written(model),
             )
         axes.plot(
             list(seen.get(domain, [])),
@@ -152,14 +153,18 @@ def cost_error_figure(panels: Mapping[str, CostAndError], x_label: str, y_label:
         axes.set_yscale("log")
         for style, (label, points) in zip(itertools.cycle(("s-", "D", "^")), panel.lines.items(), strict=False):
             shown = sorted(p for p in points if np.isfinite(p[1]))
-            axes.plot([c for c, _ in shown], [e for _, e in shown], style, markersize=3.5, linewidth=1, color="0.3", label=label)
+            axes.plot(
+                [c for c, _ in shown], [e for _, e in shown], style, markersize=3.5, linewidth=1, color="0.3", label=as_written(label)
+            )
         colors = {name: PALETTE[k % len(PALETTE)] for k, name in enumerate(dict.fromkeys(label.partition(",")[0] for label in panel.marks))}
         for label, points in panel.marks.items():
             shown, color = [p for p in points if np.isfinite(p[1])], colors[label.partition(",")[0]]
             face = "none" if "," in label else color
             x, y = [c for c, _ in shown], [e for _, e in shown]
-            axes.plot(x, y, "o", markersize=5, markeredgewidth=1.4, color=color, markerfacecolor=face, label=label, zorder=4)  # above lines
-        for style, (label, error) in zip((":", "--"), panel.levels.items(), strict=False):
+            axes.plot(
+                x, y, "o", markersize=5, markeredgewidth=1.4, color=color, markerfacecolor=face, label=as_written(label), zorder=4
+            )  # above lines
+        for style, (label, error) in zip(itertools.cycle((":", "--", "-.")), panel.levels.items(), strict=False):
             axes.axhline(error, linestyle=style, linewidth=1, color="0.6", label=label)
         low, high = np.log10(axes.get_xlim())
         axes.set_xlim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))  # whole decades, because labels between them would overlap

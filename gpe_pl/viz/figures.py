@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from gpe_pl.trajectory.trajectory import Trajectory
-from gpe_pl.viz.captions import pictured
+from gpe_pl.viz.captions import as_written, pictured
 from gpe_pl.viz.coloring import PALETTE, ColorBy, Coloring, curve_styles
 from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip, new_figure
 
@@ -105,7 +105,7 @@ def error_curve_figure(
         time = frame_dt * np.arange(1, band.shape[1] + 1)
         low, middle, high = np.where(band > 0, np.minimum(band, ceiling), np.nan)
         axes.fill_between(time, low, high, color=color, alpha=0.18, linewidth=0)
-        axes.plot(time, middle, color=color, linestyle=dash, linewidth=1.4, label=name)
+        axes.plot(time, middle, color=color, linestyle=dash, linewidth=1.4, label=as_written(name))
     axes.set_xlabel("time [s]", fontsize=8)
     axes.set_ylabel(label, fontsize=8)
     axes.set_xlim(left=0)
@@ -162,7 +162,7 @@ def _draw_losses(axes: Axes, runs: Mapping[str, Sequence[tuple[np.ndarray, np.nd
         common = np.unique(np.concatenate([s for s, _ in seeds]))
         common = common[(common >= start) & (common <= stop)]
         middle = np.exp(np.median([_log_at(common, s, v) for s, v in seeds], axis=0))
-        axes.plot(common, np.minimum(middle, ceiling), color=color, linestyle=dash, linewidth=1.6, label=name)
+        axes.plot(common, np.minimum(middle, ceiling), color=color, linestyle=dash, linewidth=1.6, label=as_written(name))
 
 
 def _log_at(at: np.ndarray, steps: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from matplotlib.ticker import EngFormatter
 
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
-from gpe_pl.viz.captions import frame_time, in_common
+from gpe_pl.viz.captions import as_written, frame_time, in_common
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.panel import Panel
 from gpe_pl.viz.scenery import INK
@@ -99,12 +99,12 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
         for j, frame in enumerate(frames):
             Panel(figure, rectangle(i, j), trajectory, coloring, above).show_frame(frame)
         x, y, _, h = rectangle(i, 0)
-        figure.text(left / 2 / TEXT_WIDTH, y + h / 2, label, rotation=90, va="center", linespacing=1.1, **style)
+        figure.text(left / 2 / TEXT_WIDTH, y + h / 2, as_written(label), rotation=90, va="center", linespacing=1.1, **style)
     for j, frame in enumerate(frames):
         x, _, w, _ = rectangle(0, j)
         text = ("" if j else "$t$ = ") + frame_time(frame, trajectories[0].metadata.frame_dt)
         figure.text(x + w / 2, 1 - (top - 0.05) / height, text, va="bottom", **style)
-    figure.text(0.5, below / height, caption, va="bottom", linespacing=1.1, **style)
+    figure.text(0.5, below / height, as_written(caption), va="bottom", linespacing=1.1, **style)
     if has_bar:
         rows_beside = len(rows) - first_with_bar
         tall = max(LOWEST_BAR, rows_beside * row_height + (rows_beside - 1) * gap)

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from gpe_pl.viz.coloring import PALETTE
@@ -56,6 +58,8 @@ def parity_figure(numbers: Mapping[str, Numbers], parameter: Sequence[float], pa
     """
     value = np.asarray(parameter, float)
     rows = 2 if np.isfinite(value).any() else 1
+    if rows == 2:  # one scale for all panels, because points without a number of a quantity are left out there
+        colors = ScalarMappable(Normalize(np.nanmin(value), np.nanmax(value)), "viridis")
     figure = new_figure(max(PANEL[0] * len(numbers), 4.0), PANEL[1] * rows + 0.3)
     figure.set_layout_engine("constrained")
     panels = figure.subplots(rows, len(numbers), squeeze=False)
@@ -64,14 +68,14 @@ def parity_figure(numbers: Mapping[str, Numbers], parameter: Sequence[float], pa
         ends = np.array([np.nanmin([true, predicted]), np.nanmax([true, predicted])])
         ends = ends + np.array([-0.05, 0.05]) * max(np.ptp(ends), 1e-12)
         axes[0].plot(ends, ends, ":", color="0.5", linewidth=1)
-        points = axes[0].scatter(true, predicted, s=14, c=value if rows == 2 else PALETTE[1], cmap="viridis")
+        axes[0].scatter(true, predicted, s=14, color=colors.to_rgba(value) if rows == 2 else PALETTE[1])
         _labelled(axes[0], f"true {name} [{unit}]", "predicted")
         if rows == 2:
             axes[1].scatter(value, true, s=16, facecolors="none", edgecolors="0.2", linewidths=0.9, label="ground truth")
             axes[1].scatter(value, predicted, s=14, marker="x", color=PALETTE[1], linewidths=1.1, label="prediction")
             _labelled(axes[1], parameter_label, f"{name} [{unit}]")
     if rows == 2:
-        bar = figure.colorbar(points, ax=panels[0, -1])
+        bar = figure.colorbar(colors, ax=panels[0, -1])
         bar.set_label(parameter_label, fontsize=7)
         bar.ax.tick_params(labelsize=6)
         panels[1, 0].legend(fontsize=6.5, frameon=False)

@@ -15,7 +15,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replacing
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
-from gpe_pl.viz.captions import frame_time, in_common, pictured
+from gpe_pl.viz.captions import as_written, frame_time, in_common, pictured
 from gpe_pl.viz.coloring import COLOR_MAPS, REFERENCE, ColorBy, Coloring
 from gpe_pl.viz.film_strip import draw_bar, draw_legend, evenly_spaced_frames
 from gpe_pl.viz.panel import HAZE, Panel
@@ -123,7 +123,9 @@ def _images(rows: dict[str, Trajectory], frames: Sequence[int], coloring: Colori
         left = gap + k * (panel_pixels + gap)
         box = (left / width, gap / height, panel_pixels / width, panel_pixels * aspect / height)
         panels.append(Panel(figure, box, trajectory, coloring))
-        figure.text((left + panel_pixels / 2) / width, 1 - line / 2 / height, name, ha="center", va="center", fontsize=10, color=INK)
+        figure.text(
+            (left + panel_pixels / 2) / width, 1 - line / 2 / height, as_written(name), ha="center", va="center", fontsize=10, color=INK
+        )
     for k, text in enumerate(caption):
         figure.text(0.5, 1 - line * (1.5 + k) / height, text, ha="center", va="center", fontsize=9, color=INK)
     if coloring.bar_label:

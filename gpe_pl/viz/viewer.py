@@ -30,7 +30,7 @@ from gpe_pl.geometry.shapes import Bowl, signed_distance
 from gpe_pl.schema import BOUNDARY, NODE_TYPES, node_code
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import AZIMUTH, ELEVATION, vertical_axis
-from gpe_pl.viz.captions import frame_time, heading, hidden_nodes, in_common, pictured, time_decimals, with_heading
+from gpe_pl.viz.captions import SHOWN_OUTSIDE, frame_time, heading, hidden_nodes, in_common, pictured, time_decimals, with_heading
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error
 from gpe_pl.viz.contact_sheet import informative_color
 from gpe_pl.viz.panel import DOT, drawn_faces, outline, polygon_edges
@@ -291,8 +291,8 @@ def _focus(trajectory: Trajectory) -> dict[str, Any]:
     if bowls:
         center, radius = np.asarray(bowls[0].center, float), bowls[0].radius
         low, high = np.maximum(low, center - radius), np.minimum(high, center + radius)
-    if trajectory.metadata.periodicity:  # nodes reach the edge
-        low, high = low - 0.5 * trajectory.metadata.spacing, high + 0.5 * trajectory.metadata.spacing
+    margin = SHOWN_OUTSIDE * trajectory.metadata.spacing
+    low, high = low - margin, high + margin
     bounds = np.asarray(trajectory.metadata.bounds, float)
     return {
         "focus": {"low": _in_3d(low), "high": _in_3d(high)},

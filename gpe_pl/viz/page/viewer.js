@@ -208,7 +208,10 @@ class Viewer {
 
   /** Returns a function of the node, or null if the trajectory does not have the quantity. */
   #quantity(of, by) {
-    if (by === "error") return of === this.truth ? null : distance(of, this.truth, this.frame);
+    if (by === "error") {
+      const apart = of === this.truth ? null : distance(of, this.truth, this.frame), { all_material } = this.arrays;
+      return apart && ((node) => Number.isNaN(all_material[node]) ? NaN : apart(node)); // walls that move are not predicted
+    }
     const fixed = this.arrays[`all_${by}`];
     return fixed ? (node) => fixed[node] : of.quantity(by, this.frame);
   }

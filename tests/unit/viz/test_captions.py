@@ -18,7 +18,8 @@ from gpe_pl.trajectory.store import read_trajectory, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz import contact_sheet as sheets
 from gpe_pl.viz import video
-from gpe_pl.viz.captions import describe, frame_time, parameter_value, row_label
+from gpe_pl.viz.camera import Camera
+from gpe_pl.viz.captions import as_written, describe, frame_time, hidden_nodes, parameter_value, row_label
 from gpe_pl.viz.contact_sheet import contact_sheet
 from gpe_pl.viz.figures import rollout_figure
 from gpe_pl.viz.video import write_animation, write_film
@@ -177,3 +178,26 @@ def test_a_distance_between_predictions_is_no_error() -> None:
 )
 def test_times_are_as_exact_as_the_time_between_frames(frame, frame_dt, expected):
     assert frame_time(frame, frame_dt) == expected
+
+
+@pytest.mark.parametrize(("place", "is_told"), [(1.0 + 0.4, False), (1.0 + 0.7, True), (-0.7, True)])
+def test_a_picture_tells_which_nodes_it_does_not_show(place: float, is_told: bool) -> None:
+    """``place`` counts spacings from the lower end, or beyond the upper one."""
+    t = truth()
+    (low, high), spacing = t.metadata.bounds[0], t.metadata.spacing
+    pos = t.pos.copy()
+    pos[0, 0, 0] = high + (place - 1) * spacing if place > 0 else low + place * spacing
+    moved = replace(t, pos=pos)
+    camera = Camera(moved)
+    assert (camera.low[0] <= pos[0, 0, 0] <= camera.high[0]) != is_told
+    assert hidden_nodes(moved, 0) == ([f"1 of {t.num_nodes} nodes are outside"] if is_told else [])
+
+
+@pytest.mark.parametrize("text", ["$a_b$ <x> & $y$", "_test", "a $ b", "plain"])
+def test_names_are_shown_as_written(text: str) -> None:
+    figure = Figure()
+    axes = figure.subplots()
+    axes.plot([1, 2], label=as_written(text))
+    (shown,) = axes.legend().get_texts()
+    clean, is_mathematics = shown._preprocess_math(shown.get_text())  # type: ignore[attr-defined]
+    assert clean.removeprefix("\u200b") == text and not is_mathematics

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib import colormaps
 
 from gpe_pl.metrics import Interval
-from gpe_pl.viz.comparison import comparison_figure, parameter_figure
+from gpe_pl.viz.comparison import CostAndError, comparison_figure, cost_error_figure, parameter_figure
 from gpe_pl.viz.coverage import CoverageCurves, coverage_figure
+from gpe_pl.viz.quantities import parity_figure
 
 NEVER = float("inf")
 
@@ -43,3 +45,20 @@ def test_coverage_below_the_usual_range_is_in_the_picture() -> None:
     figure = coverage_figure({"seen": bad}, [0.5, 0.9], 0.9, 0.1, {2: "0.2 s", 3: "0.3 s"})
     for axes in figure.axes[:2]:
         assert axes.get_ylim()[0] < 20.0
+
+
+def test_every_level_of_costs_and_errors_has_its_line() -> None:
+    levels = {"ballistic": 3.0, "stops at walls": 2.0, "constant velocity": 1.0}
+    (axes,) = cost_error_figure({"sand": CostAndError({"solver": [(1.0, 2.0)]}, {"$a_b$ model": [(2.0, 1.0)]}, levels)}, "s", "m²").axes
+    flat = {str(line.get_label()): (line.get_linestyle(), line.get_ydata()[0]) for line in axes.lines}
+    assert [flat[name][1] for name in levels] == [3.0, 2.0, 1.0] and len({flat[name][0] for name in levels}) == 3
+    assert r"\$a_b\$ model" in flat, "not as mathematics"
+
+
+def test_colours_of_a_parity_figure_have_one_scale() -> None:
+    numbers = {"height": ("m", [(1.0, 1.1), (2.0, 2.1), (3.0, 3.1)]), "peak stress": ("Pa", [(1.0, np.nan), (2.0, np.nan), (3.0, np.nan)])}
+    figure = parity_figure(numbers, [1e6, 3e6, 5e6], "Young's modulus [Pa]", "solids")
+    bar = figure.axes[-1]
+    assert bar.get_ylim() == pytest.approx((1e6, 5e6))
+    colors = figure.axes[0].collections[0].get_facecolors()
+    np.testing.assert_allclose(colors, colormaps["viridis"]([0.0, 0.5, 1.0]))
