@@ -40,7 +40,7 @@ from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.pretrained import checkpoint_path
 from gpe_pl.learned.rollout_settings import RolloutSettings
 from gpe_pl.learned.start_checks import SceneError as SceneError
-from gpe_pl.learned.start_checks import check_start
+from gpe_pl.learned.start_checks import check_start, inside_obstacles
 from gpe_pl.learned.transfer import Transfer
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
@@ -390,7 +390,7 @@ class LearnedSimulator(nn.Module):
         check_start(state, self.builder.metadata, where)
         clamped = "; clamped to the nearest trained value" if self.clamps_parameters else ""
         found = [(kind, line + clamped) for kind, line in self._outside_parameters(state)]
-        for kind, line in (*found, *self._outside_scene(state)):
+        for kind, line in (*found, *self._outside_scene(state), *inside_obstacles(state, self.builder.metadata.spacing)):
             self._warn_once(kind, line)
         return state
 

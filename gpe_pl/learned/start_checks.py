@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 
 from gpe_pl.errors import GpeError
+from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.graphs.features import history_of
 from gpe_pl.schema import node_code
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata
+
+DEEPEST = 0.5
+"""Depth in walls and obstacles from which a start is warned of [rest spacings]. Nodes of some solvers rest a little inside a surface."""
 
 
 class SceneError(GpeError, ValueError):
@@ -45,3 +51,23 @@ def check_start(state: State, metadata: Metadata, where: str) -> None:
             if wrong.any():
                 node, value = int(rows[wrong][0]), float(column[wrong][0])
                 raise SceneError(f"node {node} ({material}): {spec.name} is {spec.quantity(value)}, must be {spec.rule}")
+
+
+def inside_obstacles(state: State, spacing: float) -> Iterator[tuple[str, str]]:
+    """Yield a kind and a line that says how many nodes start inside walls and obstacles, if any. Containment moves such nodes out within a frame.
+
+    Args:
+        state: state of the scene, as tensors.
+        spacing: rest spacing [m].
+    """
+    if not state.boundary.shapes:
+        return
+    depth = -signed_distance(state.boundary.shapes, state.pos)
+    if state.loads is not None:  # clamped nodes may be inside what holds them
+        depth[state.loads.rows] = 0.0
+    deep = depth > DEEPEST * spacing
+    if bool(deep.any()):
+        yield (
+            "nodes inside obstacles",
+            f"{int(deep.sum())} of {state.num_nodes} nodes start inside walls or obstacles, up to {float(depth.max()):.3g} m deep",
+        )

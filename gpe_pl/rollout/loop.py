@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -183,8 +184,8 @@ def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int,
     """
     live, num_steps, guards = dict[int, State](), dict[int, int](), dict[int, Guard]()
     for scene, start in enumerate(starts):
-        if start.num_steps < 0:
-            raise ValueError(f"num_steps={start.num_steps}: must be at least 0")
+        if not isinstance(start.num_steps, Integral) or start.num_steps < 0:
+            raise ValueError(f"num_steps={start.num_steps}: must be a whole number of at least 0")
         guard = None if start.guard is None else start.guard.of(start.state)
         impossible = (
             unfit(simulator, start.metadata)

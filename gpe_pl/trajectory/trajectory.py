@@ -312,7 +312,7 @@ class Trajectory:
             PeriodicityError: the connectivity radius is not below half a period.
         """
         pos = numbers("pos", pos, {"frame": None, "node": None, "dim": None})
-        pos = pos.astype(np.float32 if pos.dtype in (np.float16, np.float32) else np.float64, copy=False)
+        pos = pos.astype(np.float32 if pos.dtype in (np.float16, np.float32) else np.float64)  # a copy: the caller may use its array again
         num_frames, num_nodes, dim = pos.shape
         if num_frames < 3 or num_nodes < 1 or dim not in (2, 3):
             raise ArrayError(f"pos [frame, node, dim] is {list(pos.shape)}: at least 3 frames, 1 node, and 2 or 3 dimensions are needed")
@@ -362,7 +362,7 @@ class Trajectory:
                 loads=loads,
             ),
             pos,
-            numbers("vel", vel, shape).astype(np.float32, copy=False),
+            numbers("vel", vel, shape).astype(np.float32),
             codes,
             per_node("mass", mass, (num_nodes,), low=float(np.finfo(np.float32).tiny)),
             columns,

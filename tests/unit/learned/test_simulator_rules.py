@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from gpe_pl.geometry.shapes import Sphere
 from gpe_pl.learned.checkpoint_file import CheckpointError
 from gpe_pl.learned.ensemble import LearnedEnsemble
 from gpe_pl.learned.simulator import LearnedSimulator, PrecisionError
 from gpe_pl.scenes.scene import Scene
+from gpe_pl.trajectory.boundary import Boundary
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -39,3 +43,13 @@ def test_every_member_of_an_ensemble_warns_of_what_it_was_not_trained_on(order: 
     scene, metadata = Scene(box=(1.0, 1.0)).block("sand", at=(0.3, 0.0), size=(0.1, 0.1), friction_angle=50).state(members[0])
     ensemble.standing(scene, metadata)
     assert "friction_angle of sand is 50 deg, trained were 20 to 42.5" in caplog.text
+
+
+@pytest.mark.parametrize("is_inside", [True, False])
+def test_a_start_inside_an_obstacle_is_warned_of(is_inside: bool, caplog: pytest.LogCaptureFixture) -> None:
+    simulator = LearnedSimulator.from_checkpoint("sand")
+    state, metadata = Scene(box=(1.0, 1.0)).block("sand", at=(0.3, 0.0), size=(0.1, 0.1), friction_angle=30).state(simulator)
+    ball = Sphere((0.35, 0.05), 0.04, 0.3) if is_inside else Sphere((0.6, 0.05), 0.04, 0.3)
+    shapes = (*state.boundary.shapes, ball)
+    simulator.standing(replace(state, boundary=Boundary.sample(shapes, metadata.spacing, 2)), metadata)
+    assert ("nodes start inside walls or obstacles, up to 0.0" in caplog.text) == is_inside

@@ -430,6 +430,10 @@ def test_a_start_whose_array_has_another_shape_is_refused(trajectory: Trajectory
     assert stopped is not None and stopped.message.startswith(f"{name} has the shape (")
 
 
-def test_a_negative_number_of_steps_is_refused(trajectory: Trajectory) -> None:
-    with pytest.raises(ValueError, match="num_steps=-1: must be at least 0"):
-        rollout(FreeFall(0.01), trajectory.state(0), -1, trajectory.metadata)
+@pytest.mark.parametrize("number", [-1, 2.5, 0.29 / 0.01])
+def test_an_impossible_number_of_steps_is_refused(trajectory: Trajectory, number: Any) -> None:
+    """0.29 / 0.01 is a little less than 29."""
+    start = Start(trajectory.state(0), 3, trajectory.metadata)
+    object.__setattr__(start, "num_steps", number)  # tests check types, users' programs do not
+    with pytest.raises(ValueError, match=f"num_steps={number}: must be a whole number of at least 0"):
+        next(frames(FreeFall(0.01), [start]))

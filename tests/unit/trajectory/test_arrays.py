@@ -431,3 +431,21 @@ def test_what_only_falls_teaches_nothing(tmp_path: Path) -> None:
     with pytest.raises(ImportFailure, match="nothing accelerates other than by gravity"):
         save_dataset(tmp_path, "mine", train=[trajectory(pos=steady)])
     assert not (tmp_path / "mine").exists()
+
+
+def test_arrays_of_the_caller_can_be_used_again() -> None:
+    for dtype in (np.float32, np.float64):
+        pos, vel = motion().astype(dtype), np.ones_like(motion(), np.float32)
+        given: dict[str, Any] = {
+            "pos": pos,
+            "vel": vel,
+            "force": np.ones_like(vel),
+            "mass": np.ones(pos.shape[1]),
+            "prescribed": np.arange(pos.shape[1]) < 2,
+        }
+        made = trajectory(**given)
+        before = {name: np.array(getattr(made, name)) for name in given}
+        for values in given.values():
+            values[:] = 0
+        for name, values in before.items():
+            np.testing.assert_array_equal(getattr(made, name), values, err_msg=name)
