@@ -419,7 +419,7 @@ class WindowDataset(Dataset[HeteroData | UnrollStart | Unroll]):
         if self.noise is not None:
             rng = np.random.default_rng((self.seed, sample))
             unit = self.velocity_unit if scale is None else self.velocity_units.get(scale, self.velocity_unit)
-            pos = self.noise.apply(pos, builder.metadata.longest_side, unit, dt, rng)
+            pos = self.noise.apply(pos, original.metadata.longest_side, unit, dt, rng)
             if is_given.any():  # their motion is given exactly
                 pos = np.where(is_given, truth[: history + 2], pos)
         velocities = integrators.velocities(pos, dt, trajectory.metadata.periodicity)

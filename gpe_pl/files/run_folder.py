@@ -19,6 +19,12 @@ HYDRA = ".hydra"
 """Subfolder of a run folder that Hydra writes. Hydra follows links in it."""
 LOGS = "log"
 """Subfolder of a run folder with the logs of a training."""
+TENSORBOARD = "tensorboard"
+"""Subfolder of a run folder with event files of TensorBoard. A resumed run continues there."""
+RUN_ID = "run_id"
+"""File in a run folder with the identifier of the run in W&B. A resumed run continues under it."""
+LOGGED = (LOGS, TENSORBOARD, RUN_ID)
+"""What a training writes before it has results."""
 LOOKUPS = ("comparison", "larger")
 """Lookup tables of ``data`` and ``size`` from which other configuration keys take their values."""
 
@@ -33,7 +39,8 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
     Args:
         run_dir: folder of the run; created if it is missing.
         config: configuration of the run.
-        results: file patterns. A folder without any such file is free, whatever its configuration. Logs of another configuration are then removed.
+        results: file patterns. A folder without any such file is free, whatever its configuration. What another configuration logged is then removed
+            (``LOGGED``), and so is the identifier under which trackers would continue its run.
 
     Raises:
         RunError: the folder has results, but its configuration is another one (the message names up to three differing keys), missing or damaged; or the
@@ -51,7 +58,8 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
             )
         return
     if not _has(path, config):
-        shutil.rmtree(run_dir / LOGS, ignore_errors=True)  # tables would have the curve of the earlier run
+        for name in LOGGED:  # tables and trackers would show the earlier run's curve as this run's
+            shutil.rmtree(run_dir / name, ignore_errors=True) if (run_dir / name).is_dir() else (run_dir / name).unlink(missing_ok=True)
     sealed.write(path, config)
 
 

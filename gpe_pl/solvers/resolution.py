@@ -177,7 +177,7 @@ def divided_mesh(state: State, factor: int) -> Divided:
         middles = csr_array((np.full(len(rows), 0.5), (rows, edges.ravel())), shape=(len(edges), count))
         origin = csr_array(vstack([origin, middles @ origin]))
     near = np.asarray(origin.argmax(axis=1)).ravel()
-    new = _mesh_state(state, near, origin @ state.pos, cells, origin @ state.vel)
+    new = _mesh_state(state, near, origin @ state.pos, cells, origin @ state.vel, origin @ _density(state))
     return Divided(replace(new, material_params=origin @ state.material_params), origin)
 
 
@@ -195,18 +195,31 @@ def _remeshed(state: State, spacing: float) -> Resolved:
     field = np.linalg.lstsq(linear, state.vel, rcond=None)[0]
     rest = state.vel - linear @ field
     vel = np.column_stack([np.ones(len(points)), points]) @ field + rest[near]
-    return Resolved(_mesh_state(state, near, points, cells, vel), lambda pos: np.einsum("nc,ncd->nd", weights, pos[nodes]))
+    return Resolved(
+        _mesh_state(state, near, points, cells, vel, _density(state)[near]), lambda pos: np.einsum("nc,ncd->nd", weights, pos[nodes])
+    )
 
 
-def _mesh_state(state: State, near: np.ndarray, pos: np.ndarray, cells: np.ndarray, vel: np.ndarray) -> State:
+def _mesh_state(state: State, near: np.ndarray, pos: np.ndarray, cells: np.ndarray, vel: np.ndarray, density: np.ndarray) -> State:
     """Return a state with another mesh of the same body and the same total mass; a new node takes other values from an old one, ``near`` [node]."""
-    corners = pos[cells]
-    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
-    mass = np.bincount(cells.ravel(), np.repeat(volume, cells.shape[1]), minlength=len(pos))
+    mass = density * _lumped_volume(pos, cells)
     components = 4 if state.dim == 2 else 6
     stress = None if state.stress is None else Stress(np.zeros((len(pos), components)), np.zeros((len(cells), components)))
     mass *= state.mass.sum() / mass.sum()
     return replace(state.take(near), pos=pos, vel=vel, mass=mass, velocity_history=None, rest_pos=pos.copy(), cells=cells, stress=stress)
+
+
+def _density(state: State) -> np.ndarray:
+    """Return the density at each node of a mesh [kg/m^dim]."""
+    assert state.cells is not None
+    return np.asarray(state.mass / _lumped_volume(state.pos, state.cells))
+
+
+def _lumped_volume(pos: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Return for each node the sum of the volumes of its cells, which are simplices [m^dim]."""
+    corners = pos[cells]
+    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+    return np.bincount(cells.ravel(), np.repeat(volume, cells.shape[1]), minlength=len(pos))
 
 
 def outline(cells: Int[np.ndarray, "cell 3"]) -> list[list[int]]:

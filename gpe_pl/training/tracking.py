@@ -20,17 +20,14 @@ from PIL import Image
 
 from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_text, replacing
+from gpe_pl.files.run_folder import RUN_ID, TENSORBOARD
 
 log = logging.getLogger(__name__)
 
 WANDB_URL = "https://api.wandb.ai"
 FILMS: tuple[Literal["gif", "mp4"], ...] = ("gif", "mp4")
-TENSORBOARD = "tensorboard"
-"""Name of the folder of TensorBoard's event files in a run's folder. A resumed run continues there."""
 MODES = ("online", "offline", "disabled", "dryrun", "run", "shared")
 """Modes that W&B takes from ``WANDB_MODE``."""
-RUN_ID = "run_id"
-"""Name of the file in a run's folder that holds the identifier of the run in W&B."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +77,11 @@ class LoggerSettings:
         import wandb
         from lightning.pytorch.loggers import WandbLogger
 
-        own = run_dir.parts[run_dir.parts.index(name) + 1 :] if name in run_dir.parts else ()  # within a sweep, this run's own part
+        _, is_within, rest = f"/{run_dir.as_posix()}/".rpartition(f"/{name}/")
+        own = rest.rstrip("/") if is_within else ""  # within a sweep, this run's own part
         options: dict[str, Any] = {"group": name, "mode": mode, "resume": "allow"}
         own_id = run_id(run_dir) if rank_zero_only.rank == 0 else None  # type: ignore[attr-defined]  # only the first process logs
-        logger = WandbLogger("/".join(own) or name, save_dir=run_dir, project=self.project, id=own_id, **options)
+        logger = WandbLogger(own or name, save_dir=run_dir, project=self.project, id=own_id, **options)
         try:
             logger.log_hyperparams({**config, "run_dir": str(run_dir)})
         except wandb.errors.Error as error:

@@ -347,3 +347,22 @@ def test_changed_metadata_are_other_data_though_no_array_is_read(store: Path) ->
     before = split_checksum(store, "train")
     edited(store, "metadata")
     assert split_checksum(store, "train") != before
+
+
+def test_position_noise_is_a_fraction_of_each_trajectorys_own_domain(tmp_path: Path) -> None:
+    """The first trajectory has a domain a quarter as long as the second one."""
+    still = np.random.default_rng(0).uniform(0.2, 0.8, (1, 400, 2)) + np.zeros((8, 1, 1))
+    write_shard(
+        tmp_path / "train" / "shard-00000.h5",
+        [
+            Trajectory.from_numpy(
+                still, 0.01, "sand", {"sand": 30.0}, bounds=((0.0, side), (0.0, 1.0)), periodic=(True, False), spacing=0.1
+            )
+            for side in (1.0, 4.0)
+        ],
+    )
+    data = dataset(tmp_path, noise=Noise(1e-3, 0.0))
+    numbers = [data.locate(window)[0] for window in range(len(data))]
+    starts = [data[StartKey(0, numbers.index(number), 1)].state.pos.numpy() for number in range(2)]
+    sizes = [np.std(start - still[0]) for start in starts]
+    assert sizes == pytest.approx([1e-3, 4e-3], rel=0.1)

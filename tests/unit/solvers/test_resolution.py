@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -82,3 +84,14 @@ def test_a_mesh_that_is_deformed_keeps_its_resolution() -> None:
         coarser(later, spacing)
     with pytest.raises(ValueError, match=r"the mesh at 0\.002 s is deformed"):
         divided_mesh(later, 2)
+
+
+def test_a_divided_mesh_keeps_its_densities() -> None:
+    state, _ = scene("fem")
+    heavy = state.pos[:, 0] > np.average(state.pos[:, 0], weights=state.mass)
+    uneven = replace(state, mass=np.where(heavy, 4.0, 1.0) * state.mass)
+    finer = divided_mesh(uneven, 2).state
+    assert finer.mass.sum() == pytest.approx(uneven.mass.sum(), rel=1e-12)
+    centre, before = (s.mass @ s.pos / s.mass.sum() for s in (finer, uneven))
+    even = state.mass @ state.pos / state.mass.sum()
+    assert np.linalg.norm(centre - before) < 0.1 * np.linalg.norm(even - before)

@@ -47,8 +47,10 @@ def test_logs_of_an_earlier_run_are_not_those_of_the_next(tmp_path: Path, now: d
     """Somebody deleted its checkpoints, so that the folder is free."""
     claim(tmp_path, CONFIG)
     (tmp_path / "log" / "version_0").mkdir(parents=True)
+    (tmp_path / "tensorboard").mkdir()
+    (tmp_path / "run_id").write_text("0123abcd")
     claim(tmp_path, now)
-    assert (tmp_path / "log").exists() == is_kept
+    assert {(tmp_path / name).exists() for name in ("log", "tensorboard", "run_id")} == {is_kept}
 
 
 @pytest.mark.parametrize("config", [CONFIG, BY_NODES])

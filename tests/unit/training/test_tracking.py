@@ -17,8 +17,9 @@ from lightning.pytorch.utilities import rank_zero_only
 from PIL import Image
 
 from gpe_pl.files.atomic import FullDiskError
+from gpe_pl.files.run_folder import RUN_ID
 from gpe_pl.training import tracking
-from gpe_pl.training.tracking import RUN_ID, LoggerSettings, TrackingError, publish, run_id
+from gpe_pl.training.tracking import LoggerSettings, TrackingError, publish, run_id
 
 
 class Recorder(Logger):
@@ -29,9 +30,9 @@ class Recorder(Logger):
     error: ClassVar[Exception | None] = None
     fails: ClassVar[tuple[str, ...]] = ("online",)
 
-    def __init__(self, name: str, mode: str, **_: Any) -> None:
+    def __init__(self, run: str, mode: str, **_: Any) -> None:
         super().__init__()
-        self.mode = mode
+        self.run, self.mode = run, mode
 
     def log_metrics(self, *_: Any) -> None: ...
 
@@ -70,6 +71,23 @@ def test_a_mode_that_wandb_does_not_have_is_refused_at_once(monkeypatch: pytest.
     with pytest.raises(TrackingError, match="WANDB_MODE=of: W&B has no such mode; it must be one of online, offline, disabled"):
         LoggerSettings("wandb")
     assert LoggerSettings("wandb", mode="offline").mode == "offline" and LoggerSettings("csv").mode is None
+
+
+@pytest.mark.parametrize(
+    ("name", "folder", "run"),
+    [
+        ("sand", "runs/sand", "sand"),
+        ("sand", "runs/sand/seed=0", "seed=0"),
+        ("study/first", "runs/study/first/model=gns/seed=1", "model=gns/seed=1"),
+        ("sand", "sand/runs/sand/seed=0", "seed=0"),
+        ("runs", "runs/runs/seed=0", "seed=0"),
+        ("sand", "elsewhere", "sand"),
+    ],
+)
+def test_a_run_of_a_sweep_is_named_after_its_own_part(tmp_path: Path, name: str, folder: str, run: str) -> None:
+    (tmp_path / folder).mkdir(parents=True)
+    *_, logger = LoggerSettings("wandb", mode="offline").loggers(tmp_path / folder, name, {})
+    assert isinstance(logger, Recorder) and logger.run == run
 
 
 def test_only_the_first_process_makes_an_identifier(tmp_path: Path, recorder: type[Recorder], monkeypatch: pytest.MonkeyPatch) -> None:
