@@ -78,6 +78,7 @@ def parity_figure(numbers: Mapping[str, Numbers], parameter: Sequence[float], pa
         bar = figure.colorbar(colors, ax=panels[0, -1])
         bar.set_label(parameter_label, fontsize=7)
         bar.ax.tick_params(labelsize=6)
+        bar.ax.yaxis.get_offset_text().set_fontsize(6)
         panels[1, 0].legend(fontsize=6.5, frameon=False)
     figure.suptitle(title, fontsize=8)
     return figure
@@ -87,4 +88,6 @@ def _labelled(axes: Axes, x: str, y: str) -> None:
     axes.set_xlabel(x, fontsize=7.5)
     axes.set_ylabel(y, fontsize=7.5)
     axes.tick_params(labelsize=6.5)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.get_offset_text().set_fontsize(6)  # a common power of ten
     axes.spines[["top", "right"]].set_visible(False)
