@@ -267,7 +267,7 @@ def _advance_frame(
         resist_nodes(pos, vel, box, reach, h, obstacles)
         _drift(pos, vel, gravity, h)
         push_out_corners(pos, mass, edges, obstacles.corners, touched, gaps)
-        push_out_nodes(pos, box, reach, obstacles)
+        push_out_nodes(pos, vel, box, reach, obstacles)
 
 
 @njit(cache=True, error_model="numpy")

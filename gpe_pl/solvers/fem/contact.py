@@ -2,7 +2,8 @@
 
 In each substep, a node that would enter an obstacle loses just enough normal velocity to arrive on the surface. It also loses tangential velocity by an
 impulse of up to μ times the normal one (Coulomb); no-slip obstacles remove all of it. Contact never adds kinetic energy, needs no stiffness, and does not
-limit the substep. In 2D, convex corners of polygons and boxes also act on the edges of the mesh between nodes; the two nodes of an edge divide the impulse in
+limit the substep. A node on a convex corner may leave along any of its faces; the corner resists by the normal that takes the least impulse. In a notch,
+both faces hold. In 2D, convex corners of polygons and boxes also act on the edges of the mesh between nodes; the two nodes of an edge divide the impulse in
 inverse proportion to their masses. Other obstacles sharper than the length of an edge are not resolved: small discs, and edges and corners in 3D.
 
 Kernels treat two dimensions as three dimensions without depth, so one contact law serves both.
@@ -23,6 +24,9 @@ from gpe_pl.schema import STICKY
 
 FIELD_CELLS = 64
 """Number of cells along the longest axis of the grid on which obstacles without nodes of their own, such as bowls, are sampled."""
+
+TIE = 1e-9
+"""Relative difference below which two faces of an obstacle are equally near, or equally easy to leave along. Rounding is smaller."""
 
 
 class Obstacles(NamedTuple):
@@ -168,41 +172,121 @@ def _sphere_gap(x, y, z, sphere):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def _box_gap(x, y, z, box):
+def _box_gap(x, y, z, u, v, w, box):
+    """Return the signed distance of a box, and the normal along which it resists a node with velocity (u, v, w)."""
+    wide, deep, high = box[3] - box[0], box[4] - box[1], box[5] - box[2]
     cx, cy, cz = x - 0.5 * (box[0] + box[3]), y - 0.5 * (box[1] + box[4]), z - 0.5 * (box[2] + box[5])
-    qx, qy, qz = abs(cx) - 0.5 * (box[3] - box[0]), abs(cy) - 0.5 * (box[4] - box[1]), abs(cz) - 0.5 * (box[5] - box[2])
+    qx, qy, qz = abs(cx) - 0.5 * wide, abs(cy) - 0.5 * deep, abs(cz) - 0.5 * high
     sx, sy, sz = math.copysign(1.0, cx), math.copysign(1.0, cy), math.copysign(1.0, cz)
     ax, ay, az = max(qx, 0.0), max(qy, 0.0), max(qz, 0.0)
-    r = math.sqrt(ax * ax + ay * ay + az * az)
-    if r > 0.0:
+    r, slack = math.sqrt(ax * ax + ay * ay + az * az), TIE * max(wide, deep, high)
+    if r > slack:
         return r, sx * ax / r, sy * ay / r, sz * az / r
-    if qx >= qy and qx >= qz:
-        return qx, sx, 0.0, 0.0
-    if qy >= qz:
-        return qy, 0.0, sy, 0.0
-    return qz, 0.0, 0.0, sz
+    gap = max(qx, qy, qz)
+    # of the faces that are equally near, take the one with the largest outward velocity, or the mean of several
+    fx = sx * u if qx >= gap - slack else -math.inf
+    fy = sy * v if qy >= gap - slack else -math.inf
+    fz = sz * w if qz >= gap - slack else -math.inf
+    largest = max(fx, fy, fz) - TIE * math.sqrt(u * u + v * v + w * w)
+    nx, ny, nz = sx if fx >= largest else 0.0, sy if fy >= largest else 0.0, sz if fz >= largest else 0.0
+    length = math.sqrt(nx * nx + ny * ny + nz * nz)
+    return gap, nx / length, ny / length, nz / length
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def _polygon_gap(x, y, edges, start, stop):
+def _polygon_gap(x, y, u, v, edges, start, stop, slack):
+    """Return the signed distance of a polygon, and the normal along which it resists a node with velocity (u, v).
+
+    Two edges whose distances differ by less than ``slack`` [m] are equally near.
+    """
     inside = False
-    nearest, nearest_square, qx, qy = start, math.inf, 0.0, 0.0
+    nearest, nearest_square, second, second_square, qx, qy = start, math.inf, start, math.inf, 0.0, 0.0
     for k in range(start, stop):
         px, py, ex, ey = x - edges[k, 0], y - edges[k, 1], edges[k, 2], edges[k, 3]
         if ((py < 0.0) != (py < ey)) and px < ex * py / ey:
             inside = not inside
-        t = min(1.0, max(0.0, (px * ex + py * ey) * edges[k, 4]))
-        dx, dy = px - t * ex, py - t * ey
+        dx, dy = _from_edge(x, y, edges, k)
         square = dx * dx + dy * dy
         if square < nearest_square:
+            second, second_square = nearest, nearest_square
             nearest, nearest_square, qx, qy = k, square, dx, dy
-    gap = -math.sqrt(nearest_square) if inside else math.sqrt(nearest_square)
-    if nearest_square * edges[nearest, 4] > 1e-18:
-        return gap, qx / gap, qy / gap
+        elif square < second_square:
+            second, second_square = k, square
+    distance = math.sqrt(nearest_square)
+    gap = -distance if inside else distance
+    nx, ny = _edge_normal(qx, qy, gap, edges, nearest, slack)
+    if second_square > (distance + slack) * (distance + slack):
+        return gap, nx, ny
+    is_corner = _is_corner(edges, nearest, second, start, stop)
+    if is_corner and gap > slack:  # the vertex is the nearest point of both edges
+        return gap, nx, ny
+    qx, qy = _from_edge(x, y, edges, second)
+    mx, my = _edge_normal(qx, qy, math.copysign(math.sqrt(second_square), gap), edges, second, slack)
+    if is_corner or gap < -slack:
+        nx, ny = _easier(u, v, nx, ny, mx, my)
+    else:
+        nx, ny = _in_notch(u, v, nx, ny, mx, my)
+    return gap, nx, ny
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _from_edge(x, y, edges, k):
+    """Return the vector from the nearest point of an edge to a point."""
+    px, py, ex, ey = x - edges[k, 0], y - edges[k, 1], edges[k, 2], edges[k, 3]
+    t = min(1.0, max(0.0, (px * ex + py * ey) * edges[k, 4]))
+    return px - t * ex, py - t * ey
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _edge_normal(dx, dy, gap, edges, k, slack):
+    """Return the outward normal at the nearest point of an edge, from the vector (dx, dy) to a point at the signed distance ``gap``."""
+    if abs(gap) > slack:
+        return dx / gap, dy / gap
     # the direction to the nearest point of an edge is meaningless within rounding of the edge
-    inv = math.sqrt(edges[nearest, 4])
-    return gap, edges[nearest, 3] * inv, -edges[nearest, 2] * inv
+    inv = math.sqrt(edges[k, 4])
+    return edges[k, 3] * inv, -edges[k, 2] * inv
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _is_corner(edges, j, k, start, stop):
+    """Tell whether two edges of a polygon meet in a convex vertex."""
+    if j > k:
+        j, k = k, j
+    if j == start and k == stop - 1:
+        j, k = k, j
+    elif k != j + 1:
+        return False
+    return edges[j, 2] * edges[k, 3] - edges[j, 3] * edges[k, 2] > 0.0
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _easier(u, v, nx, ny, mx, my):
+    """Return the one of two normals along which a velocity leads further out, or their mean if both are equal."""
+    difference = u * (mx - nx) + v * (my - ny)
+    if abs(difference) > TIE * math.sqrt(u * u + v * v):
+        return (mx, my) if difference > 0.0 else (nx, ny)
+    length = math.sqrt((nx + mx) ** 2 + (ny + my) ** 2)
+    if length > TIE:
+        return (nx + mx) / length, (ny + my) / length
+    return nx, ny
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _in_notch(u, v, nx, ny, mx, my):
+    """Return the direction of the impulse that keeps a velocity out of two faces; a node that both faces hold stops."""
+    a, b = u * nx + v * ny, u * mx + v * my
+    if b < a:
+        a, b, nx, ny, mx, my = b, a, mx, my, nx, ny
+    speed = math.sqrt(u * u + v * v)
+    if a < 0.0 and b - a * (nx * mx + ny * my) < -TIE * speed:
+        return -u / speed, -v / speed
+    return nx, ny
 
 
 @njit(cache=True, error_model="numpy")
@@ -273,10 +357,11 @@ def resist_nodes(pos, vel, box, reach, h, obstacles):
         xl, yl, xh, yh, friction = obstacles.polygons[k]
         if _apart(box, reach, xl, yl, 0.0, xh, yh, 0.0):
             continue
+        start, stop, slack = obstacles.first_edge[k], obstacles.first_edge[k + 1], TIE * max(xh - xl, yh - yl)
         for p in range(pos.shape[0]):
             x, y = pos[p, 0], pos[p, 1]
             if x > xl - reach and x < xh + reach and y > yl - reach and y < yh + reach:
-                gap, nx, ny = _polygon_gap(x, y, obstacles.edges, obstacles.first_edge[k], obstacles.first_edge[k + 1])
+                gap, nx, ny = _polygon_gap(x, y, vel[p, 0], vel[p, 1], obstacles.edges, start, stop, slack)
                 _slow(vel, p, gap, nx, ny, 0.0, friction, h)
     for k in range(obstacles.spheres.shape[0]):
         x, y, z, r, friction = obstacles.spheres[k]
@@ -291,7 +376,7 @@ def resist_nodes(pos, vel, box, reach, h, obstacles):
         if _apart(box, reach, xl, yl, zl, xh, yh, zh):
             continue
         for p in range(pos.shape[0]):
-            gap, nx, ny, nz = _box_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.boxes[k])
+            gap, nx, ny, nz = _box_gap(pos[p, 0], pos[p, 1], pos[p, 2], vel[p, 0], vel[p, 1], vel[p, 2], obstacles.boxes[k])
             if gap < reach:
                 _slow(vel, p, gap, nx, ny, nz, friction, h)
     for k in range(obstacles.field_grids.shape[0]):
@@ -312,7 +397,7 @@ def resist_nodes(pos, vel, box, reach, h, obstacles):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def push_out_nodes(pos, box, reach, obstacles):
+def push_out_nodes(pos, vel, box, reach, obstacles):
     """Move nodes inside an obstacle, due to rounding or curved surfaces, to its surface; walls come last, so that no node ends outside them.
 
     ``box`` and ``reach`` are the values before the nodes moved.
@@ -322,10 +407,11 @@ def push_out_nodes(pos, box, reach, obstacles):
         xl, yl, xh, yh, _ = obstacles.polygons[k]
         if _apart(box, margin, xl, yl, 0.0, xh, yh, 0.0):
             continue
+        start, stop, slack = obstacles.first_edge[k], obstacles.first_edge[k + 1], TIE * max(xh - xl, yh - yl)
         for p in range(pos.shape[0]):
             x, y = pos[p, 0], pos[p, 1]
             if x > xl and x < xh and y > yl and y < yh:
-                gap, nx, ny = _polygon_gap(x, y, obstacles.edges, obstacles.first_edge[k], obstacles.first_edge[k + 1])
+                gap, nx, ny = _polygon_gap(x, y, vel[p, 0], vel[p, 1], obstacles.edges, start, stop, slack)
                 _push(pos, p, gap, nx, ny, 0.0)
     for k in range(obstacles.spheres.shape[0]):
         x, y, z, r, _ = obstacles.spheres[k]
@@ -339,7 +425,7 @@ def push_out_nodes(pos, box, reach, obstacles):
         if _apart(box, margin, xl, yl, zl, xh, yh, zh):
             continue
         for p in range(pos.shape[0]):
-            gap, nx, ny, nz = _box_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.boxes[k])
+            gap, nx, ny, nz = _box_gap(pos[p, 0], pos[p, 1], pos[p, 2], vel[p, 0], vel[p, 1], vel[p, 2], obstacles.boxes[k])
             _push(pos, p, gap, nx, ny, nz)
     for k in range(obstacles.field_grids.shape[0]):
         field, grid = _field(obstacles, k), obstacles.field_grids[k]

@@ -1,5 +1,6 @@
 """The finite element solver as a ``Simulator``: purity, restart, hostile input, and contact beyond the physics tests."""
 
+import itertools
 import math
 from dataclasses import fields, replace
 
@@ -11,10 +12,12 @@ from gpe_pl.rollout.loop import SimulationError, Simulator
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers import fem as fem_package
 from gpe_pl.solvers.fem import FEM
+from gpe_pl.solvers.fem.contact import collect, push_out_nodes, resist_nodes
 from gpe_pl.solvers.fem.elements import SMALLEST_RATIO, build_mesh, cauchy_stress, elastic_energy
 from gpe_pl.solvers.materials import lame_parameters
 from gpe_pl.solvers.solid_scenes import SolidScene
 from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 SQUARE = ((0.0, 1.0), (0.0, 1.0))
 SCENES = {
@@ -266,6 +269,107 @@ def test_a_thin_plate_holds_in_a_large_box_as_a_grid_of_distances_too():
 
 
 # --- what is refused ------------------------------------------------------------------------------------------------------------------------
+
+
+STEP = ((0.55, 0.1), (0.8, 0.1), (0.8, 0.3), (0.55, 0.3))
+NOTCH = ((0.45, 0.1), (0.8, 0.1), (0.8, 0.5), (0.6, 0.5), (0.6, 0.3), (0.45, 0.3))
+
+
+def image(state, axes, signs, shapes):
+    """Return the state with its axes in another order and some of them reversed, in the unit box and with other shapes."""
+    axes, signs = np.array(axes), np.array(signs)
+    turns_over = np.linalg.det(np.eye(state.dim)[axes] * signs) < 0
+    pos, rest_pos = ((x[:, axes] - 0.5) * signs + 0.5 for x in (state.pos, state.rest_pos))
+    # quads then run the other way round, and tetrahedra swap two corners
+    cells = state.cells if not turns_over else state.cells[:, ::-1] if state.dim == 2 else state.cells[:, [1, 0, 2, 3]]
+    boundary = Boundary.sample(tuple(shapes), 0.05, state.dim)
+    return replace(
+        state,
+        pos=pos,
+        rest_pos=rest_pos,
+        cells=cells,
+        vel=state.vel[:, axes] * signs,
+        gravity=state.gravity[axes] * signs,
+        boundary=boundary,
+    )
+
+
+@pytest.mark.parametrize(
+    ("outline", "velocity", "low"), [(STEP, (1.3, -1.1), (0.33, 0.44)), (NOTCH, (0.9, -2.6), (0.38, 0.47))], ids=["corner", "notch"]
+)
+def test_the_first_vertex_and_the_axes_do_not_matter(outline, velocity, low):
+    """A node meets a vertex to the last bit. Before, the edge that came first in the list acted, and bodies ended up to 0.4 m apart."""
+    fem, state = falling_square((Polygon(outline, 0.3),), velocity=velocity, low=low)
+    expected = run(fem, state, 40).pos
+    for axes, signs in itertools.product([(0, 1), (1, 0)], [(1, 1), (-1, 1)]):
+        vertices = (np.array(outline)[:, axes] - 0.5) * signs + 0.5
+        vertices = vertices if (axes == (0, 1)) == (signs == (1, 1)) else vertices[::-1]
+        for k in range(len(outline)):
+            after = run(fem, image(state, axes, signs, [Polygon(tuple(map(tuple, np.roll(vertices, k, axis=0).tolist())), 0.3)]), 40)
+            back = np.empty_like(after.pos)
+            back[:, axes] = (after.pos - 0.5) * signs + 0.5
+            np.testing.assert_allclose(back, expected, atol=1e-9)
+    if outline is STEP:
+        box = replace(state, boundary=Boundary.sample((Box(STEP[0], STEP[2], 0.3),), 0.05, 2))
+        np.testing.assert_allclose(run(fem, box, 40).pos, expected, atol=1e-9)
+
+
+def test_axes_do_not_matter_at_the_edge_of_a_box():
+    """A tetrahedron meets the edge of a box head-on with one corner. Before, it then slid along the face of the first axis."""
+    pos = np.array([[0.4375, 0.4, 0.4375], [0.35, 0.6, 0.55], [0.3, 0.45, 0.5], [0.4, 0.5, 0.7]])
+    low, high = np.array([0.5, 0.25, 0.25]), np.array([0.75, 0.75, 0.375])
+    state = State(
+        pos, np.tile((1.0, 0.1, -1.0), (4, 1)), np.full(4, node_code("solid"), np.uint8), np.full(4, 1.0), np.full((4, 1), 1e5), Boundary.empty(3),
+        np.zeros(3), rest_pos=pos, cells=np.arange(4)[None],
+    )  # fmt: skip
+    fem, ends = FEM(bounds=(*SQUARE, (0.0, 1.0))), []
+    for axes in itertools.permutations(range(3)):
+        box = Box(tuple(low[list(axes)].tolist()), tuple(high[list(axes)].tolist()), 0.0)
+        start = image(state, axes, (1, 1, 1), [box])
+        ends.append(run(fem, start, 30).pos[:, np.argsort(axes)])
+    np.testing.assert_allclose(ends, [ends[0]] * 6, atol=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_nodes_on_an_edge_slide_along_either_face(dim):
+    """Rounding in the position of the node changes nothing. A node that moves towards the edge along the bisector stops."""
+    box = Box((0.5,) * dim, (0.8,) * dim, 0.0)
+    obstacles = collect((box,), (*SQUARE, (0.0, 1.0))[:dim])
+    for x, y in itertools.product([0.5, 0.5 + 1e-16, 0.5 - 6e-17], repeat=2):
+        pos = np.array([[x, y, 0.65 if dim == 3 else 0.0]])
+        for velocity, expected in [
+            ((0.7, -0.2), (0.7, -0.2)),
+            ((0.2, 0.7), (0.0, 0.7)),
+            ((0.7, 0.2), (0.7, 0.0)),
+            ((0.5, 0.5), (0.0, 0.0)),
+        ]:
+            vel = np.array([[*velocity, 0.0]])
+            resist_nodes(pos, vel, np.concatenate([pos[0], pos[0]]), 0.05, 1e-4, obstacles)
+            np.testing.assert_allclose(vel[0], (*expected, 0.0), atol=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_nodes_in_a_box_come_out_where_their_velocity_leads(dim):
+    """The two nearest faces are equally far from the node."""
+    obstacles = collect((Box((0.5,) * dim, (0.8,) * dim, 0.0),), (*SQUARE, (0.0, 1.0))[:dim])
+    for velocity, expected in [((-1.0, 0.3), (0.5, 0.52)), ((0.2, -0.1), (0.52, 0.5))]:
+        pos = np.array([[0.52, 0.52, 0.65 if dim == 3 else 0.0]])
+        push_out_nodes(pos, np.array([[*velocity, 0.0]]), np.concatenate([pos[0], pos[0]]), 0.05, obstacles)
+        np.testing.assert_allclose(pos[0, :2], expected, atol=1e-12)
+
+
+def test_both_faces_of_a_notch_hold():
+    obstacles = collect((Polygon(NOTCH, 0.0),), SQUARE)
+    pos = np.array([[0.6, 0.3, 0.0]])
+    for velocity, expected in [
+        ((1.0, -1.0), (0.0, 0.0)),
+        ((-1.0, -1.0), (-1.0, 0.0)),
+        ((1.0, 1.0), (0.0, 1.0)),
+        ((-1.0, 1.0), (-1.0, 1.0)),
+    ]:
+        vel = np.array([[*velocity, 0.0]])
+        resist_nodes(pos, vel, np.concatenate([pos[0], pos[0]]), 0.05, 1e-4, obstacles)
+        np.testing.assert_allclose(vel[0], (*expected, 0.0), atol=1e-9)
 
 
 def poke(state, name, node, value):
