@@ -146,17 +146,34 @@ def make_solids(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ..
     )
 
 
-def _open_fraction(corners: list[np.ndarray], slices: int = 8) -> np.ndarray:
-    """Return the fraction of a segment, square or cube in free space from signed distances of its corners; exact along the last axis, else by midpoints."""
+def _open_fraction(corners: list[np.ndarray]) -> np.ndarray:
+    """Return the fraction of a segment or square in free space from signed distances of its corners, the last axis fastest; exact for planes along axes.
+
+    A square is sliced along the axis with the smaller difference of distances. Equal differences take the mean of both ways. So the order of axes does not
+    matter.
+    """
     if len(corners) == 2:
-        high = np.maximum(*corners)
-        return np.where(high > 0, high / np.where(high > 0, high - np.minimum(np.minimum(*corners), 0.0), 1.0), 0.0)
-    half = len(corners) // 2
-    total = np.zeros_like(corners[0])
+        return _open_part(*corners)
+    a, b, c, d = corners
+    along_first, along_last = np.abs((c - a) + (d - b)), np.abs((b - a) + (d - c))
+    across, down = _open_slices(a, b, c, d), _open_slices(a, c, b, d)
+    equal = np.abs(along_last - along_first) <= 1e-9
+    return np.where(equal, 0.5 * (across + down), np.where(along_last > along_first, across, down))
+
+
+def _open_slices(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, slices: int = 8) -> np.ndarray:
+    """Return the mean open part of segments from the side a-c of a square to its side b-d, by midpoints."""
+    total = np.zeros_like(a)
     for k in range(slices):
         t = (k + 0.5) / slices
-        total += _open_fraction([(1 - t) * a + t * b for a, b in zip(corners[:half], corners[half:], strict=True)], slices)
+        total += _open_part((1 - t) * a + t * c, (1 - t) * b + t * d)
     return total / slices
+
+
+def _open_part(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the fraction of a segment in free space from the signed distances of its ends."""
+    high = np.maximum(a, b)
+    return np.where(high > 0, high / np.where(high > 0, high - np.minimum(np.minimum(a, b), 0.0), 1.0), 0.0)
 
 
 def _rooms(shapes: tuple[Shape, ...], grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,6 @@
 """The parts of the liquid solver: linear algebra, open fractions, kernels, and refusals."""
 
+import itertools
 import math
 import subprocess
 import sys
@@ -124,6 +125,34 @@ def test_walls_are_where_the_shapes_say(dim):
     raised = make_solids((Box((-9.0,) * dim, (9.0,) * (dim - 1) + (0.53125,), 0.0),), bounds, 1 / 8)
     cell = (PADDING,) * (dim - 1) + (PADDING + 4,)
     np.testing.assert_allclose(raised.area[0].reshape((8 + 2 * PADDING,) * dim)[cell], 0.75, atol=1e-12)
+
+
+@pytest.mark.parametrize("fraction", [0.05, 0.44, 0.5, 0.6, 0.94])
+def test_open_fractions_beside_planes_along_each_axis(fraction):
+    """Before, a plane across x left a half of some faces open where it should have left 0.44, and none for 0.05."""
+    bounds, cell = ((0.0, 1.0),) * 3, 1 / 8
+    for axis in range(3):
+        low = np.full(3, -9.0)
+        low[axis] = (4 + fraction) * cell
+        area = make_solids((Box(tuple(low.tolist()), (9.0,) * 3, 0.0),), bounds, cell).area.reshape(3, *(8 + 2 * PADDING,) * 3)
+        for other in {0, 1, 2} - {axis}:
+            cut = np.take(area[other], PADDING + 4, axis)[PADDING + 1 : -PADDING, PADDING + 1 : -PADDING]
+            np.testing.assert_allclose(cut, fraction, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["ball", "box"])
+def test_open_fractions_do_not_depend_on_the_order_of_axes(name):
+    bounds = ((0.0, 1.0),) * 3
+    middle, half = np.array([0.52, 0.47, 0.41]), np.array([0.2, 0.23, 0.28])
+
+    def area(axes):
+        low, high = (tuple(x[list(axes)].tolist()) for x in (middle - half, middle + half))
+        shape = Sphere(tuple(middle[list(axes)].tolist()), 0.313, 0.0) if name == "ball" else Box(low, high, 0.0)
+        return make_solids((shape,), bounds, 1 / 16).area.reshape(3, *(16 + 2 * PADDING,) * 3)
+
+    expected = area((0, 1, 2))
+    for axes in itertools.permutations(range(3)):
+        np.testing.assert_allclose(area(axes), expected[list(axes)].transpose(0, *(1 + k for k in axes)), atol=1e-12)
 
 
 def test_the_thickness_of_obstacles_is_measured_once(monkeypatch):
