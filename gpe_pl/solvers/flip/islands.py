@@ -21,9 +21,9 @@ def _root(parent, i):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def find_islands(active, strides, area, density, weight, liquid, island):
-    """Label the connected cells that hold mass.
+    """Label the cells that hold mass and are connected by open faces.
 
-    Two particles that share a face of the grid are in one island, so islands do not act on each other.
+    Two particles on one side of a wall that share a face of the grid are in one island, so islands do not act on each other.
 
     Args:
         active: indices of the cells that liquid reaches, in ascending order.
@@ -44,7 +44,7 @@ def find_islands(active, strides, area, density, weight, liquid, island):
         c = active[n]
         if density[c] > 0.0:
             for a in range(dim):
-                if density[c - strides[a]] > 0.0:
+                if density[c - strides[a]] > 0.0 and area[a, c] > 0.0:  # spaces that a wall divides keep their own volumes
                     i, j = _root(parent, n), _root(parent, island[c - strides[a]])
                     parent[max(i, j)] = min(i, j)
     is_free, is_full = np.ones(active.shape[0], dtype=np.bool_), np.ones(active.shape[0], dtype=np.bool_)

@@ -21,6 +21,7 @@ from gpe_pl.solvers.flip.pressure import surface_distance
 from gpe_pl.solvers.flip.solver import Fields
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
+from tests.particles import block, run, together
 
 
 def liquid(dim=2, count=200, boundary=None, seed=0):
@@ -266,6 +267,23 @@ def test_separate_bodies_do_not_act_on_each_other():
         after = flip.step(after)
     np.testing.assert_allclose(after.pos[64:], state.pos[64:] + 0.5 * 0.1**2 * state.gravity, atol=1e-14)
     assert np.abs(after.pos[:64] - state.pos[:64]).max() < 0.04
+
+
+@pytest.mark.parametrize("filled", [1.0, 0.5])
+@pytest.mark.parametrize("thick", [1, 2, 3])
+def test_spaces_that_a_wall_divides_keep_their_volumes(thick, filled):
+    """The left one is full and closed. Before, kernels of the particles met in walls of up to two cells, and the density system had no solution."""
+    cell, bounds = 1 / 24, ((0.0, 1.0), (0.0, 0.5))
+    left, right = 0.5 - (thick // 2) * cell, 0.5 + (thick - thick // 2) * cell
+    boundary = Boundary.sample((*domain_walls(bounds, 0.0), Box((left, 0.0), (right, 0.5), 0.0)), 0.1, 2)
+    full = block([0.0, 0.0], [left, 0.5], cell / 2, "fluid", gravity=(0.0, -9.81), boundary=boundary, jitter=0.1)
+    other = block([right, 0.0], [1.0 - right, 0.5 * filled], cell / 2, "fluid", jitter=0.1, seed=2)
+    start = together(("fluid",), full, other)
+    after = run(FLIP(bounds=bounds, grid_spacing=cell, frame_dt=0.01), start, 20)
+    is_left = np.arange(start.num_nodes) < full.num_nodes
+    np.testing.assert_array_equal(after.pos[:, 0] < 0.5, is_left)
+    for side in (is_left, ~is_left):
+        np.testing.assert_allclose(after.pos[side].mean(axis=0), start.pos[side].mean(axis=0), atol=1e-3)
 
 
 def test_particles_inside_a_solid_come_out():
