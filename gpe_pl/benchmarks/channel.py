@@ -70,11 +70,14 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
     """Return a record per scene and simulator, and Markdown tables.
 
     Raises:
-        ChannelError: a scene is not open, or the solver stopped.
+        ChannelError: a scene is not open, the solver stopped, or two checkpoints have the same name.
         CheckpointError: a checkpoint cannot be read. The records of those before it are kept for the next run.
     """
     parts, records = FinishedParts(folder / PARTS), list[dict[str, Any]]()
     names = [SOLVER, CONTROL, *settings.checkpoints]
+    labels = [checkpoint_label(name) for name in settings.checkpoints]
+    if twice := next((label for label in labels if labels.count(label) > 1), None):
+        raise ChannelError(f"two checkpoints are called {twice}; copy one of them to a file of another name")
     with progress_bar("simulators") as on_progress:
         for case, spec in specs.items():
             places: list[Place] = [(split, k) for split, count in settings.scenes.items() for k in range(min(count, spec.counts[split]))]
@@ -87,10 +90,11 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
 
 def _stored(name: str, case: str, spec: DatasetSpec, places: list[Place], seconds: float, parts: FinishedParts) -> list[dict[str, Any]]:
     model = None if name in (SOLVER, CONTROL) else of_stored_frames(name)
-    about = {"simulator": name if model is None else fingerprint_of(model), "data": spec.as_dict(), "scenes": places, "seconds": seconds}
+    label = name if model is None else checkpoint_label(name)
+    about: dict[str, Any] = {"simulator": name if model is None else fingerprint_of(model), "label": label, "case": case}
+    about |= {"data": spec.as_dict(), "scenes": places, "seconds": seconds}
     found = parts.get(about)
     if found is None:
-        label = name if model is None else checkpoint_label(name)
         found = [{"case": case, "simulator": label, **record} for record in channel_records(name, model, spec, places, seconds)]
         parts.put(about, found)
     return found

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Annotated, Any, cast
 
 import numpy as np
@@ -57,6 +58,10 @@ class Settings:
     num_scenes: Annotated[int, Field(ge=1)] = 6
     times: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1)] = field(default_factory=lambda: [0.05, 0.1, 0.2, 0.3])
     num_workers: Annotated[int, Field(ge=1)] = 1
+
+    def __post_init__(self) -> None:
+        if any(later <= earlier for earlier, later in pairwise(self.times)):
+            raise ValueError(f"times={self.times}: must ascend")
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 
 from gpe_pl.benchmarks.cost_and_error import (
     FEWEST_SCENES,
+    ROUNDING,
     WINNING_HORIZONS,
     Comparison,
     Point,
@@ -16,6 +17,8 @@ from gpe_pl.benchmarks.cost_and_error import (
     cost_at_error,
     error_at_cost,
     front,
+    is_as_accurate,
+    is_below,
     paired_ratio,
     ratio_at_cost,
     winners,
@@ -32,7 +35,7 @@ def summary(cases: Mapping[str, Sequence[Point]]) -> str:
     """Return a table with a row per case: what the model that is nearest to winning lacks, and the verdict.
 
     The nearest model has the smallest geometric mean, over horizons, of its error relative to that of a solver of the same cost. Failed rollouts make this
-    ratio infinite. If every solver costs more than a model at some horizon, only the other horizons count.
+    ratio infinite. Horizons without a comparison do not count (``ratio_at_cost``).
     """
     horizons = list(dict.fromkeys(h for points in cases.values() for h in points[0].mse))
     header = ["case", "nearest model", *(f"error @{h}" for h in horizons), "time at equal error", "verdict"]
@@ -42,20 +45,20 @@ def summary(cases: Mapping[str, Sequence[Point]]) -> str:
         learned = [p for p in points if p.family == "learned"]
         nearest = min(learned, key=lambda p: _mean_ratio(p, solvers))
         own = [h for h in horizons if h in nearest.mse]
-        slower = [nearest.cost / cost_at_error(solvers, nearest.error(h), h) if np.isfinite(nearest.error(h)) else math.inf for h in own]
+        slower = [_slower(nearest, solvers, h) for h in own]
         cells = [_ratio(ratio_at_cost(nearest, solvers, h), len(nearest.mse[h])) if h in own else "–" for h in horizons]
         lines.append(table_row([case, nearest.name, *cells, _times(slower), _verdict(nearest, solvers, own)]))
     note = (
         "Error: that of the nearest model over that of a solver of the same cost, with its 95 % interval over paired scenes. Time: that of the model over that "
-        "of a solver of the same error, at the horizons in this order; above 1 the model is slower, 0 means that no solver is as accurate, and inf that a "
-        "rollout of the model failed. Bold: the "
-        "interval lies below 1."
+        "of a solver of the same error, at the horizons in this order; above 1 the model is slower, 0 means that no solver is as accurate, – that "
+        "the model is cheaper and less accurate than every solver, and inf that a rollout of the model failed. Where every solver costs more, errors are "
+        "compared with the cheapest one if the model is better than that. Bold: the interval lies below 1."
     )
     return "\n".join([*lines, "", note])
 
 
 def _mean_ratio(point: Point, solvers: Sequence[Point]) -> float:
-    """Return the geometric mean over horizons of a model's error relative to that of a solver of the same cost; infinite if every solver costs more."""
+    """Return the geometric mean over horizons of a model's error relative to that of a solver of the same cost; infinite if there is no comparison."""
     if not all(np.isfinite(values).all() for values in point.mse.values()):
         return math.inf
     ratios = [ratio.estimate for h in point.mse if (ratio := ratio_at_cost(point, solvers, h)) is not None]
@@ -66,13 +69,28 @@ def _verdict(point: Point, solvers: Sequence[Point], horizons: Sequence[str]) ->
     """Say at how many horizons a model is better, worse, or neither."""
     if winners([*solvers, point], horizons):
         return "**wins**"
-    ratios = [ratio for h in horizons if (ratio := ratio_at_cost(point, solvers, h)) is not None]
-    worse = sum(ratio.low > 1 or not np.isfinite(ratio.estimate) for ratio in ratios)
-    return f"loses at {worse} of {len(horizons)}" if worse else "level"
+    ratios = [ratio_at_cost(point, solvers, h) for h in horizons]
+    failed = [not np.isfinite(point.error(h)) for h in horizons]
+    worse = sum(has_failed or (ratio is not None and ratio.low > 1) for ratio, has_failed in zip(ratios, failed, strict=True))
+    if worse:
+        return f"loses at {worse} of {len(horizons)}"
+    apart = sum(ratio is None for ratio in ratios)
+    return f"cheaper and less accurate than every solver at {apart} of {len(horizons)}" if apart else "level"
+
+
+def _slower(point: Point, solvers: Sequence[Point], horizon: str) -> float:
+    """Return the time of a model over that of a solver of at most the same error.
+
+    It is infinite if a rollout failed, and NaN if the model is cheaper and less accurate than every solver.
+    """
+    if not np.isfinite(point.error(horizon)):
+        return math.inf
+    ratio = point.cost / cost_at_error(solvers, point.error(horizon), horizon)
+    return ratio if ratio > 1 or is_as_accurate(point, solvers, horizon) else math.nan
 
 
 def _times(ratios: Sequence[float]) -> str:
-    return ", ".join(f"{ratio:.2g}" for ratio in ratios)
+    return ", ".join("–" if math.isnan(ratio) else f"{ratio:.2g}" for ratio in ratios)
 
 
 def section(case: str, comparison: Comparison, num_trajectories: int) -> str:
@@ -161,7 +179,7 @@ def _superiority(learned: Sequence[Point], solvers: Sequence[Point], horizons: S
         return f"Emulator superiority (closer to the reference than the solver of its labels): fewer than {FEWEST_SCENES} scenes are too few to say."
     closer = []
     for point in (p for p in learned if p.teacher in by_name):
-        below = [h for h in horizons if paired_ratio(point.mse[h], by_name[point.teacher].mse[h]).high < 1]
+        below = [h for h in horizons if is_below(paired_ratio(point.mse[h], by_name[point.teacher].mse[h]))]
         closer += [f"{point.name} (@{', @'.join(below)})"] if below else []
     found = f"{'; '.join(closer)}: the interval lies below 1" if closer else "no model is, at any horizon"
     return f"Emulator superiority (closer to the reference than the solver of its labels): {found}."
@@ -177,7 +195,7 @@ def _ratio(interval: Interval | None, num_scenes: int) -> str:
     if interval is None:
         return "every solver costs more"
     text = f"{interval.estimate:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
-    return f"**{text}**" if interval.high < 1 and num_scenes >= FEWEST_SCENES else text
+    return f"**{text}**" if is_below(interval) and num_scenes >= FEWEST_SCENES else text
 
 
 def _pays_off(seconds: float) -> str:
@@ -201,14 +219,14 @@ def verdicts(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
     solvers = [p for p in points if p.family == "solver"]
     learned = [p for p in points if p.family == "learned"]
     for horizon in horizons:
-        comparable = [p for p in learned if p.error(horizon) <= front(solvers, horizon)[0].error(horizon)]
+        comparable = [p for p in learned if is_as_accurate(p, solvers, horizon)]
         gain = {p.name: cost_at_error(solvers, p.error(horizon), horizon) / p.cost for p in comparable}
         if not gain:
             yield f"- @{horizon}: {_none_as_accurate(learned, front(solvers, horizon)[0], horizon)}"
             continue
         nearest = max(comparable, key=lambda p: gain[p.name])
-        if gain[nearest.name] > 1:
-            ahead = [name for name, value in gain.items() if value > 1]
+        if gain[nearest.name] > ROUNDING:
+            ahead = [name for name, value in gain.items() if value > ROUNDING]
             yield f"- @{horizon}: **below the solver's curve**: {', '.join(ahead)}."
             continue
         error = error_at_cost(solvers, nearest.cost, horizon)

@@ -124,7 +124,7 @@ def rollout_records(name: str, spec: DatasetSpec, num_scenes: int, num_rounds: i
         if any(trajectory.termination is not None for trajectory in ended):
             raise StepError(f"{name}: a rollout of {num_scenes} scenes stopped and was not timed; check the checkpoint")
         step = min(step, seconds) if k else inf  # the first round loads compiled code
-        rate = max(rate, gemm_rate(num_nodes, model.settings["hidden_channels"], "cpu"))
+        rate = max(rate, gemm_rate(num_nodes, model.settings["hidden_channels"], "cpu", time.process_time))
     case = name if num_scenes == 1 else f"{name}, {num_scenes} scenes"
     log.info("%s: a step takes %.2f ms, %.1f times its products", case, 1e3 * step, step * rate / flop)
     values = {"step_time": (step, "s"), "product_time": (flop / rate, "s"), "step_ratio": (step * rate / flop, "1")}

@@ -278,6 +278,7 @@ def run(
     for name, spec in specs.items():
         about: dict[str, Any] = {
             "num_rounds": settings.num_rounds,
+            "num_threads": settings.num_threads,
             "model": fingerprint_of(LearnedSimulator.from_checkpoint(name)),
             "data": spec.as_dict(),
         }

@@ -67,7 +67,7 @@ def timed(simulator: Any, at: Start, data: Trajectory, kept_from: int) -> tuple[
         log.info("%s stopped: %s", type(simulator).__name__, error)
     pos = np.stack([at.resolved.restrict(p) for p, _ in frames[:wanted]])
     vel = np.stack([(at.resolved.restrict(p + dt * v) - at.resolved.restrict(p)) / dt for p, v in frames[:wanted]])
-    trajectory = replace(data, pos=pos, vel=vel, stress=None).frames(kept_from - first)
+    trajectory = replace(data, pos=pos, vel=vel, stress=None).frames(min(kept_from - first, len(pos) - 1))
     return trajectory, seconds / max(1, num_steps) / (every * dt)
 
 

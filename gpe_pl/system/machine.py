@@ -98,28 +98,29 @@ def synchronized(function: Callable[[], Any], device: str) -> Callable[[], Any]:
     return call
 
 
-def best_time(function: Callable[[], Any], device: str, num_rounds: int = 10) -> float:
+def best_time(function: Callable[[], Any], device: str, num_rounds: int = 10, clock: Callable[[], float] = time.perf_counter) -> float:
     """Return the time of the fastest of several calls [s], after one call that does not count."""
     call = synchronized(function, device)
     call()
     times = []
     for _ in range(num_rounds):
-        start = time.perf_counter()
+        start = clock()
         call()
-        times.append(time.perf_counter() - start)
+        times.append(clock() - start)
     return min(times)
 
 
-def gemm_rate(rows: int, channels: int, device: str) -> float:
+def gemm_rate(rows: int, channels: int, device: str, clock: Callable[[], float] = time.perf_counter) -> float:
     """Return the rate of the product of a matrix [rows, channels] with a square one [FLOP/s].
 
-    The rate is also measured with at most 1024 rows, whose product fits into the cache. The higher rate is returned.
+    Compare it with times of the same ``clock``: processor time counts every thread. The rate is also measured with at most 1024 rows, whose product fits into
+    the cache. The higher rate is returned.
     """
     square = torch.randn(channels, channels, device=device)
     rates = []
     for height in (rows, min(rows, 1024)):
         matrix, result = torch.randn(2, height, channels, device=device)
-        seconds = best_time(partial(torch.mm, matrix, square, out=result), device, 50)
+        seconds = best_time(partial(torch.mm, matrix, square, out=result), device, 50, clock)
         rates.append(2 * height * channels**2 / seconds)
     return max(rates)
 

@@ -61,12 +61,15 @@ def run(settings: Settings, specs: Mapping[str, DatasetSpec], own: Path) -> tupl
         own: folder of the suite's results. What ``suite=learning_sets`` has measured in the folder beside it is reported, too.
 
     Raises:
-        OutsideError: a checkpoint was trained on none of ``specs``, or a file of the user cannot be read.
+        OutsideError: a checkpoint was trained on none of ``specs``, two have the same name, or a file of the user cannot be read.
         EngineError: an engine failed.
     """
     torch.set_num_threads(settings.num_threads)
     folder = Path(settings.folder).expanduser()
     candidates = [candidate_of(checkpoint, specs) for checkpoint in settings.checkpoints]
+    names = [candidate.name for candidate in candidates]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise OutsideError(f"two checkpoints are called {twice}; copy one of them to a file of another name")
     records = [record for name in settings.experiments for c in candidates for record in experiments.compared(name, c, folder)]
     present = [name for name in settings.engines if not engines.SCENES[name].is_missing()]
     records += [record for name in present for c in candidates for record in engines.compared(name, c)]

@@ -85,6 +85,13 @@ def test_data_without_inlet_are_refused() -> None:
         list(channel.channel_records(CONTROL, None, spec, [("test", 0)], 0.1))
 
 
+def test_models_of_one_name_are_refused(tmp_path: Path) -> None:
+    spec = dataset("data=channel", "size=tiny", "dimension=2")
+    settings = Settings([str(tmp_path / "old" / "sand"), str(tmp_path / "new" / "sand")], {"channel": Case([])}, {"test": 1}, 0.1)
+    with pytest.raises(ChannelError, match="two checkpoints are called sand; copy one of them to a file of another name"):
+        channel.run(settings, {"channel": spec}, tmp_path)
+
+
 @pytest.mark.slow
 def test_a_suite_goes_on_after_an_error(tmp_path: Path) -> None:
     spec = dataset("data=channel", "size=tiny", "dimension=2", "data.scene.changing=0.0")

@@ -58,3 +58,9 @@ def test_too_few_scenes_and_failed_solutions_are_named(monkeypatch: pytest.Monke
     monkeypatch.setattr(finer_labels, "solved", fails)
     with pytest.raises(LabelsError, match="sand, scene 0 of test: node 3 is not finite"):
         run(replace(settings, num_scenes=1), {"sand": spec})
+
+
+def test_times_must_ascend() -> None:
+    """The solutions are kept in the order of their frames."""
+    with pytest.raises(ValueError, match=r"times=\[0.2, 0.05\]: must ascend"):
+        Settings({"elastomer": Case([])}, times=[0.2, 0.05])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from gpe_pl.benchmarks.outside.experiments import (
     report,
     run_out,
 )
+from gpe_pl.config.datasets import dataset
+from gpe_pl.learned.pretrained import checkpoint_path
 
 
 def test_run_out_is_that_of_the_published_fit() -> None:
@@ -103,3 +106,13 @@ def test_the_report_names_what_is_missing_and_what_is_there(tmp_path: Path, monk
     assert f"suite=learning_sets suite.folder={tmp_path} 'suite.only=[fluidfall]'`" in text and "suite.only=[beam]" not in text
     assert "| ricegrip | full rollout, RMS distance [m] |  | 0.5 (ballistic) | 0.25 | 1 of 1 | 0 |" in text
     assert suite.figures(records).keys() == {"droplet_m"}
+
+
+def test_models_of_one_name_are_refused(tmp_path: Path) -> None:
+    for folder in ("old", "new"):
+        (tmp_path / folder).mkdir()
+        shutil.copy(checkpoint_path("sand"), tmp_path / folder / "sand.ckpt")
+    checkpoints = [str(tmp_path / folder / "sand.ckpt") for folder in ("old", "new")]
+    settings = suite.Settings({}, checkpoints=checkpoints)
+    with pytest.raises(OutsideError, match="two checkpoints are called sand; copy one of them to a file of another name"):
+        suite.run(settings, {"sand": dataset("data=sand", "size=small")}, tmp_path)

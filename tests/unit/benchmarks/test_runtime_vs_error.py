@@ -97,13 +97,37 @@ def test_errors_at_equal_time_are_compared_scene_by_scene() -> None:
     better, worse = (scenes(name, 2.0, list(factor * 2e-3 * hard), "learned") for name, factor in (("better", 0.5), ("worse", 1.5)))
     ratio = ratio_at_cost(better, solvers, "20")
     assert ratio is not None and (ratio.low, ratio.estimate, ratio.high) == pytest.approx((0.5, 0.5, 0.5))
-    assert ratio_at_cost(scenes("free", 0.5, [1e-3] * 5, "learned"), solvers, "20") is None
+    free = ratio_at_cost(scenes("free", 0.5, list(1e-3 * hard), "learned"), solvers, "20")
+    assert free is not None and free.estimate == pytest.approx(0.25), "the cheapest solver has more time, and is still worse"
+    assert ratio_at_cost(scenes("careless", 0.5, list(5e-3 * hard), "learned"), solvers, "20") is None
     once = replace(better, name="once", mse={"20": better.mse["20"], "50": worse.mse["50"]})
     assert winners([*solvers, better, worse, once], ["20", "50"]) == ["better"]
     few = [replace(p, mse={h: errors[:4] for h, errors in p.mse.items()}) for p in (*solvers, better)]
     assert winners(few, ["20", "50"]) == []
     dearest = ratio_at_cost(replace(better, seconds=[100.0]), solvers, "20")
     assert dearest is not None and dearest.estimate == pytest.approx(1.0)
+
+
+def test_models_that_are_cheaper_than_every_solver_have_a_verdict() -> None:
+    """Whether they win, fail or are useless."""
+
+    def case(cost: float, error: float) -> str:
+        def scenes(name: str, own: float, error: float, family: Family = "solver") -> Point:
+            return Point(name, family, [own], dict.fromkeys(("20", "full"), [error] * 6))
+
+        solvers = [scenes("fine", 10.0, 1.0), scenes("medium", 2.0, 4.0), scenes("coarse", 1.0, 9.0)]
+        return summary({"case": [*solvers, scenes("model", cost, error, "learned")]}).splitlines()[4]
+
+    assert "0.00 [0.00, 0.00]" in case(0.5, 0.01) and case(0.5, 0.01).endswith("| 0, 0 | **wins** |")
+    assert case(0.5, 1e4).endswith(
+        "| every solver costs more | every solver costs more | –, – | cheaper and less accurate than every solver at 2 of 2 |"
+    )
+    assert case(0.5, float("inf")).endswith("| inf, inf | loses at 2 of 2 |")
+    assert case(5.0, float("inf")).endswith("| inf, inf | loses at 2 of 2 |")
+    assert case(1.0, 9.0).endswith("| 1, 1 | level |")
+    assert break_even(replace(point("careless", 0.1, 1e4, "learned"), overhead=100.0), LADDER, "full", duration=1.0) == float("inf")
+    (line,) = verdicts([*LADDER, replace(LADDER[1], name="copy", family="learned")], ["full"])
+    assert "no learned model passes" in line
 
 
 def test_training_pays_off_after_what_it_saves() -> None:
