@@ -189,10 +189,11 @@ def image(path: Path, low: np.ndarray, high: np.ndarray) -> Callable[[np.ndarray
     Raises:
         BodyFault: the file cannot be read, has pixels of an unknown range, or has no dark pixel.
     """
-    from PIL import Image
+    from PIL import Image, ImageOps
 
     try:
-        with Image.open(path) as opened:
+        with Image.open(path) as file:
+            opened = ImageOps.exif_transpose(file)  # upright, as viewers show it
             mode = opened.mode
             if mode.startswith("I;16"):
                 brightness = np.asarray(opened, np.float64) / (2**16 - 1)

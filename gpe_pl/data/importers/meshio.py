@@ -251,7 +251,10 @@ class _Arrays:
         Raises:
             Refusal: a frame lacks the array or has another shape of it, or the settings name an array that is not there.
         """
-        return self._stacked(role, [frame.point_data.get(self.name(role)) for frame in self.frames])
+        name = self.name(role)
+        if name in self.frames[0].cell_data and name not in self.frames[0].point_data:
+            raise Refusal(f"{self.frames[0].file} has {name!r} in cells, and values of points are needed; write it as point data", 0)
+        return self._stacked(role, [frame.point_data.get(name) for frame in self.frames])
 
     def at_points(self, role: str, rest: np.ndarray) -> np.ndarray | None:
         """Return values of points, or the means of the values of cells around them [frame, point, …]; None if there are none."""

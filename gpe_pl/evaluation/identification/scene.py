@@ -71,7 +71,8 @@ def identify_parameters(
     seen = observed if isinstance(observed, Observations) else Observations.of(observed)
     began, processor = time.monotonic(), time.process_time()
     ranges = {**(trained_bounds(simulator) if isinstance(simulator, LearnedSimulator) else {}), **(bounds or {})}
-    rollouts = shooting(simulator, seen, unknowns_of(seen.completed, unknowns, ranges, per_body, seen.first_frame), shooting_settings)
+    sought = unknowns_of(seen.completed, unknowns, ranges, per_body, seen.first_frame, seen.trajectory)
+    rollouts = shooting(simulator, seen, sought, shooting_settings)
     found = search(rollouts, search_settings, on_progress)
     if not found.misfit < math.log(FAILED):
         raise ShootingError(

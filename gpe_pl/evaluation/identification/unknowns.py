@@ -156,17 +156,23 @@ def _across(gravity: Any, axis: int) -> Any:
 
 
 def unknowns_of(
-    trajectory: Trajectory, wanted: Sequence[str] | str | None, ranges: Bounds, per_body: bool = False, first_frame: int = 0
+    trajectory: Trajectory,
+    wanted: Sequence[str] | str | None,
+    ranges: Bounds,
+    per_body: bool = False,
+    first_frame: int = 0,
+    stored: Trajectory | None = None,
 ) -> Unknowns:
     """Return the unknowns of a scene.
 
     Args:
-        trajectory: the observed scene; its stored values become ``truth``.
+        trajectory: the observed scene.
         wanted: names ``MATERIAL``, ``MATERIAL.PARAMETER``, ``velocity`` or ``gravity``, or one such name; None takes all parameters of all
             materials of the scene.
         ranges: bounds of material parameters by name ``MATERIAL.PARAMETER``.
         per_body: give each body values of its own.
         first_frame: frame in which nodes near each other are one body.
+        stored: the scene as it is stored, whose values become ``truth``, if the observed one was completed from parts of it.
 
     Raises:
         UnknownError: the scene has no such unknown, or a parameter has no bounds. The message names it.
@@ -181,7 +187,7 @@ def unknowns_of(
         if material in (VELOCITY, GRAVITY) and parameter:
             raise UnknownError(f"unknowns: {name!r}: {material} has no parts; write {material}")
         if material == VELOCITY:
-            found += _velocities(trajectory, groups)
+            found += _velocities(trajectory, groups, (stored or trajectory).vel[0])
         elif material == GRAVITY:
             found += _gravity(trajectory)
         else:
@@ -195,7 +201,10 @@ def unknowns_of(
 
 
 def scene_bodies(trajectory: Trajectory, frame: int = 0) -> list[np.ndarray]:
-    """Return the nodes of each body in a frame: connected by cells, or within ``BODY_SPACINGS`` and of one material."""
+    """Return the nodes of each body in a frame: connected by cells, or within ``BODY_SPACINGS`` and of one material.
+
+    Nodes without cells belong to the mesh of their material that they lie beside.
+    """
     num_nodes = trajectory.num_nodes
     meshes = [] if trajectory.cells is None else bodies(trajectory.cells, num_nodes)
     free = np.setdiff1d(np.arange(num_nodes), np.concatenate([*meshes, np.zeros(0, dtype=np.int64)]).astype(np.int64))
@@ -206,7 +215,23 @@ def scene_bodies(trajectory: Trajectory, frame: int = 0) -> list[np.ndarray]:
     kind = trajectory.node_type[free]
     pairs = pairs[kind[pairs[:, 0]] == kind[pairs[:, 1]]].astype(np.int64)
     number, label = components(pairs.T, len(free))
-    return [*meshes, *(free[label == k] for k in range(number))]
+    loose = [free[label == k] for k in range(number)]
+    beside = [_mesh_beside(trajectory, frame, meshes, own) for own in loose]
+    joined = [np.concatenate([mesh, *(own for own, at in zip(loose, beside, strict=True) if at == k)]) for k, mesh in enumerate(meshes)]
+    return [*map(np.sort, joined), *(own for own, at in zip(loose, beside, strict=True) if at is None)]
+
+
+def _mesh_beside(trajectory: Trajectory, frame: int, meshes: list[np.ndarray], loose: np.ndarray) -> int | None:
+    """Return the number of the mesh of the same material with the nearest node to ``loose`` nodes, within ``BODY_SPACINGS``; None if there is none."""
+    nearest, most = None, BODY_SPACINGS * trajectory.metadata.spacing
+    pos = trajectory.pos[frame].astype(np.float64)
+    for k, mesh in enumerate(meshes):
+        if trajectory.node_type[mesh[0]] == trajectory.node_type[loose[0]]:
+            ways = trajectory.metadata.periodicity.shortest(pos[loose, None] - pos[mesh])
+            distance = float(np.linalg.norm(ways, axis=-1).min())
+            if distance <= most:
+                nearest, most = k, distance
+    return nearest
 
 
 def _grouped(rows: np.ndarray, groups: list[np.ndarray]) -> list[tuple[str, str, np.ndarray]]:
@@ -256,7 +281,8 @@ def _check_range(name: str, spec: MaterialParameter, bounds: tuple[float, float]
         raise UnknownError(f"bounds of {name}: [{low:g}, {high:g}]: must be {spec.rule}")
 
 
-def _velocities(trajectory: Trajectory, groups: list[np.ndarray]) -> list[Unknown]:
+def _velocities(trajectory: Trajectory, groups: list[np.ndarray], stored: np.ndarray) -> list[Unknown]:
+    """``stored`` are the stored velocities in the first frame [node, dim]; nodes of a body that differ have no true value."""
     pos = trajectory.pos.astype(np.float64)
     steps = np.abs(displacement(pos[1:], pos[:-1], trajectory.metadata)) / trajectory.metadata.frame_dt
     steps = steps[np.isfinite(steps).all(axis=(1, 2))]
@@ -267,7 +293,8 @@ def _velocities(trajectory: Trajectory, groups: list[np.ndarray]) -> list[Unknow
         Unknown(f"{VELOCITY}.{axis}{suffix}", f"initial velocity {axis}{label}", "m/s", -fastest, fastest, False, VELOCITY, k, nodes, truth)
         for suffix, label, nodes in _grouped(np.arange(trajectory.num_nodes), groups)
         for k, axis in enumerate("xyz"[: trajectory.metadata.dim])
-        for truth in [float(trajectory.vel[0, nodes, k].mean())]
+        for values in [stored[nodes, k].astype(np.float64)]
+        for truth in [float(values.mean()) if np.ptp(values) <= 1e-5 * max(1e-3, np.abs(values).max()) else math.nan]
     ]
 
 

@@ -91,6 +91,17 @@ def test_an_image_is_a_body_where_it_is_dark(tmp_path: Path) -> None:
     assert state.num_nodes * SPACING**2 == pytest.approx(0.2 * 0.1, rel=0.15)
 
 
+def test_an_image_is_upright_as_viewers_show_it(tmp_path: Path) -> None:
+    """A camera that was turned says so in the file."""
+    pixels = np.full((40, 40), 255, np.uint8)
+    pixels[:20, :20] = 0  # upper left as stored, upper right as shown
+    tags = Image.Exif()
+    tags[0x0112] = 6
+    Image.fromarray(pixels).save(tmp_path / "body.png", exif=tags)
+    state, _ = Scene(box=(1.0, 1.0)).image("sand", tmp_path / "body.png", at=(0.2, 0.2), size=(0.4, 0.4)).state(model("sand"))
+    assert (state.pos >= np.array([0.4, 0.4]) - SPACING).all() and (state.pos <= np.array([0.6, 0.6]) + SPACING).all()
+
+
 def test_an_image_of_16_bits_is_that_of_8_and_other_ranges_are_refused(tmp_path: Path) -> None:
     pixels = np.full((40, 40), 255, np.uint8)
     pixels[:20], pixels[20:30] = 0, 40

@@ -363,6 +363,16 @@ def without(name: str, at: int = 0, until: int = FRAMES) -> Callable[[Any, int],
     return edit
 
 
+def in_cells(name: str) -> Callable[[Any, int], Any]:
+    """Return an edit that adds an array of ones to the cells."""
+
+    def edit(mesh: Any, frame: int) -> Any:
+        mesh.cell_data[name] = [np.ones(len(block.data)) for block in mesh.cells]
+        return mesh
+
+    return edit
+
+
 def quadratic(mesh: Any, frame: int) -> Any:
     return meshio.Mesh(POINTS, [("line3", np.array([[0, 1, 2]]))], point_data=mesh.point_data)
 
@@ -387,6 +397,7 @@ def flat_stress(mesh: Any, frame: int) -> Any:
         (without("S", 0, 1), r"step_0.vtu has no array 'S', and step_1.vtu has one; write it in all frames"),
         (without("prescribed", 0, 2), r"step_0.vtu has no array 'prescribed', and step_2.vtu has one; write it in all frames"),
         (without("velocity", 4), r"step_4.vtu has no array 'velocity', step_0.vtu has one of shape \[12, 3\]"),
+        (in_cells("material"), r"step_0.vtu has 'material' in cells, and values of points are needed; write it as point data"),
         (without("density"), r"has forces but no masses, and a model reads f/m; name them with arrays={mass: …} or arrays={density: …}"),
         (quadratic, r"step_0.vtu has cells of kind line3; cells must be linear: line, triangle"),
         (beyond, r"step_0.vtu has cells of kind hexahedron with points 0 to 12; there are 12 points"),

@@ -15,6 +15,7 @@ from gpe_pl.evaluation.identification.scene import identify_parameters
 from gpe_pl.evaluation.identification.search import SearchSettings, search
 from gpe_pl.evaluation.identification.shooting import ShootingError, ShootingSettings, shooting
 from gpe_pl.evaluation.identification.unknowns import Unknowns, scene_bodies, unknowns_of
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests.drag import ANGLE, BOUNDS, Drag, thrown
 
 
@@ -87,6 +88,26 @@ def test_bodies_are_those_of_the_first_observed_frame() -> None:
     flags[:5], hidden[:5] = False, 0.0
     answer = identify_parameters(Drag(), Observations(replace(seen, pos=hidden), flags), per_body=True, bounds=BOUNDS)
     assert [value.name for value in answer.values] == ["sand.friction_angle#1", "sand.friction_angle#2"]
+
+
+def test_nodes_without_cells_belong_to_the_mesh_beside_them() -> None:
+    """Two blocks of a mesh, a node beside the second one, and one that is alone."""
+    square = 0.1 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    rest = np.concatenate([square + 0.2, square + np.array([1.0, 0.2]), [[1.0, 0.4]], [[2.0, 2.0]]])
+    pos = np.repeat(rest[None], 4, axis=0)
+    cells = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    scene = Trajectory.from_numpy(pos, 0.01, "elastomer", {"elastomer": 1e5}, bounds=((0.0, 3.0),) * 2, spacing=0.1, cells=cells)
+    assert [nodes.tolist() for nodes in scene_bodies(scene)] == [[0, 1, 2, 3], [4, 5, 6, 7, 8], [9]]
+
+
+@pytest.mark.parametrize("settings", [{}, {"every": 4}, {"added_noise": 2e-4}])
+def test_the_stored_velocity_is_the_true_one_whatever_is_observed(settings: dict[str, float]) -> None:
+    seen = thrown()
+    observed = Observations.of(seen, ObservationSettings(**settings))  # type: ignore[arg-type]
+    items = unknowns_of(observed.completed, ["velocity"], {}, stored=observed.trajectory).items
+    assert [unknown.truth for unknown in items] == pytest.approx(seen.vel[0].mean(axis=0).tolist(), rel=1e-5, nan_ok=True)
+    turning = replace(seen, vel=seen.vel + np.linspace(-1, 1, seen.num_nodes, dtype=np.float32)[:, None])
+    assert all(math.isnan(unknown.truth) for unknown in unknowns_of(turning, ["velocity"], {}).items), "bodies have different ones"
 
 
 def test_open_scenes_are_refused() -> None:
