@@ -15,13 +15,14 @@ from gpe_pl.schema import STICKY
 from gpe_pl.solvers.materials import MEMORY, VISCOSITY
 from gpe_pl.solvers.mpm import smoothing, transfer_2d, transfer_3d
 from gpe_pl.solvers.mpm.collider import keep_out
+from gpe_pl.solvers.mpm.prescribed import carry, impose
 
 OK, NOT_FINITE, ESCAPE, TOO_MANY_SUBSTEPS = 0, 1, 2, 3
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame_dt, cfl, max_substeps, last_substep):
+def advance(particles, collider, motion, gravity, bounds, origin, counts, spacing, frame_dt, cfl, max_substeps, last_substep):
     """Advance the particles in place by one frame.
 
     Positions follow velocities half a substep later, so gravity acts over the mean of a substep and the one before. A body in free flight then stays on its
@@ -30,6 +31,7 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
     Args:
         particles: all particles.
         collider: walls and obstacles.
+        motion: motion that openings prescribe, a ``Prescribed``.
         gravity: acceleration of gravity [dim] in m/s².
         bounds: ``(low, high)`` of the domain per axis [m].
         origin, counts, spacing: position of the first grid node [m], number of nodes per axis, and grid spacing [m].
@@ -59,10 +61,12 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
         np.zeros(grid.shape if remembers else (0, dim + 1)), np.zeros(stress.shape),
     )  # fmt: skip
     squared = transfer_2d.squared_wave_speed(particles) if dim == 2 else transfer_3d.squared_wave_speed(particles)
+    carry(particles, motion, 0.0)
     while True:
         status, node, speed = _survey(particles.pos, particles.vel, bounds, origin, counts, spacing, active)
         if status != OK or remaining <= 0.0:
             return status, node, substeps, last_substep
+        speed = max(speed, motion.fastest)  # an opening may be faster than what comes to it
         needed = max(remaining * (math.sqrt(squared) + speed) / (cfl * spacing), remaining * fall_rate, remaining * diffusion_rate) * (
             1.0 - 1e-12
         )
@@ -82,7 +86,9 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
         else:
             squared = transfer_3d.deform(particles, stress, last_substep)
             transfer_3d.particles_to_grid(particles, stress, flat, counts, origin, inv, h)
-        _move_grid(grid, collider, gravity, 0.5 * (h + last_substep) if last_substep > 0.0 else h, active, counts)
+        gravity_time = 0.5 * (h + last_substep) if last_substep > 0.0 else h
+        impose(grid, motion, gravity, gravity_time)
+        _move_grid(grid, collider, gravity, gravity_time, active, counts)
         last_substep = h
         if dim == 2:
             transfer_2d.grid_to_particles(particles, flat, counts, origin, inv, h)
@@ -90,6 +96,7 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
             transfer_3d.grid_to_particles(particles, flat, counts, origin, inv, h)
         if remembers:
             smoothing.give_back(particles, remainder, counts, inv, h)
+        carry(particles, motion, frame_dt - remaining)
         keep_out(particles.pos, particles.vel, collider, counts, origin, inv)
 
 

@@ -18,6 +18,7 @@ from gpe_pl.solvers.materials import MEMORY, NUM_CONSTANTS, Elastomer, Fluid, Sa
 from gpe_pl.solvers.mpm.collider import Collider, collider
 from gpe_pl.solvers.mpm.frame import ESCAPE, NOT_FINITE, OK, advance
 from gpe_pl.solvers.mpm.particles import Particles
+from gpe_pl.solvers.mpm.prescribed import prescribed
 from gpe_pl.solvers.mpm.restart import gradients
 from gpe_pl.solvers.mpm.stress import cauchy_stress
 from gpe_pl.solvers.supported import check_surroundings
@@ -75,7 +76,7 @@ class MPM:
 
     Each step advances one frame by substeps that satisfy ``h (c + |v|_max) <= cfl Δ``, ``h² |g| <= cfl Δ / 4`` and ``8 h ν <= Δ²``. Here c is the speed of the
     fastest elastic wave at the present deformation and hardening. Substeps depend on the current state alone, so a restart repeats a run bit by bit.
-    Obstacles must be at least one grid cell thick. In openings with a speed, particles are undeformed and have this speed at the beginning of every frame.
+    Obstacles must be at least one grid cell thick. Particles in openings with a speed are undeformed, and move with it; see ``mpm.prescribed``.
 
     Attributes:
         bounds: ``(low, high)`` of the domain along each axis [m]; each extent is a whole multiple of the grid spacing.
@@ -169,6 +170,7 @@ class MPM:
         status, node, num_substeps, last_substep = advance(
             particles,
             self._collider(state.boundary, origin, counts),
+            prescribed(state.openings, (state.time, state.time + self.frame_dt), particles.pos, origin, counts, self.grid_spacing),
             np.asarray(state.gravity, dtype=np.float64),
             np.asarray(self.bounds),
             np.asarray(origin),
