@@ -18,7 +18,9 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.graphs.compiled_graph import works_on
 from gpe_pl.graphs.topology import Topology
+from gpe_pl.nn.static_friction import pushed, supported
 from gpe_pl.nn.stores import contents
+from gpe_pl.schema import BOUNDARY
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.rigid_bodies import moved_rigidly
@@ -58,21 +60,26 @@ def moved(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor
     return new
 
 
-def keep_slow(state: State, new: State, topology: Topology, duration: float) -> None:
+def keep_slow(state: State, new: State, topology: Topology, fraction: float, dt: float) -> None:
     """Put nodes that static friction keeps in place back to their old positions, with zero velocity, in the arrays of a new state (see ``nn.static_friction``).
 
     Args:
         state: state before the step, whose walls are at rest.
         new: state that ``moved`` and ``with_frame_velocity`` returned. Its arrays are changed.
         topology: topology of ``state``.
-        duration: time in which gravity gives the speed below which a node keeps its position [s].
+        fraction: fraction of the speed that gravity gives in one frame, below which a node keeps its position.
+        dt: frame interval [s].
     """
     assert topology.islands is not None
+    label, is_free = topology.islands.label, topology.islands.is_free
+    if state.openings or state.loads is not None:  # islands that these alone touch are not free, but nothing supports them
+        walls = [(label[topology.rows[r[2]]][own[1]], torch.zeros(own.shape[1])) for r, own in topology.edges.items() if r[0] == BOUNDARY]
+        is_free = ~supported(is_free, [*walls, *pushed(state, label, dt)])
     given = None if state.loads is None else (new.pos.clone(), new.vel.clone())
     history = new.vel[:, None] if new.velocity_history is None else new.velocity_history
     at_frame = new.vel if new.frame_velocity is None else new.frame_velocity
-    before = (state.pos.numpy(), state.vel.numpy(), topology.islands.label.numpy(), topology.islands.is_free.numpy())
-    _keep_slow(*before, state.gravity.numpy(), duration, new.pos.numpy(), new.vel.numpy(), history.numpy(), at_frame.numpy())
+    before = (state.pos.numpy(), state.vel.numpy(), label.numpy(), is_free.numpy())
+    _keep_slow(*before, state.gravity.numpy(), fraction * dt, new.pos.numpy(), new.vel.numpy(), history.numpy(), at_frame.numpy())
     if state.loads is not None and given is not None:  # static friction does not stop nodes whose motion is given
         held = torch.from_numpy(state.loads.prescribed)
         for values, moved_as_given in ((new.pos, given[0]), (new.vel, given[1]), (history[:, -1], given[1]), (at_frame, given[1])):

@@ -45,7 +45,7 @@ from gpe_pl.learned.transfer import Transfer
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
 from gpe_pl.nn.node_loads import scaled
-from gpe_pl.nn.static_friction import keeps_position, supported
+from gpe_pl.nn.static_friction import keeps_position, pushed, supported
 from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.rollout.loop import SimulationError, sound
 from gpe_pl.rollout.skips import Skips
@@ -458,7 +458,7 @@ class LearnedSimulator(nn.Module):
             new = [self._with_static_friction(*parts) for parts in zip(states, new, graphs, strict=True)]
         elif self.static_friction:  # walls are at rest
             for state, after, topology in zip(states, new, topologies, strict=True):
-                next_states.keep_slow(state, after, topology, self.static_friction * builder.metadata.frame_dt)
+                next_states.keep_slow(state, after, topology, self.static_friction, builder.metadata.frame_dt)
         return new
 
     def moved(self, states: list[State], graphs: list[HeteroData], predicted: Prediction) -> list[State]:
@@ -492,7 +492,8 @@ class LearnedSimulator(nn.Module):
         island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
-        stays = keeps_position(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))
+        is_supported = self.supported(graph, pushed(state, island, self.builder.metadata.frame_dt))
+        stays = keeps_position(state.vel, new.vel, island, is_supported, self.slowest(state.gravity))
         stays = all_of_bodies(stays, state.rigid_body)[:, None]
         new = new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))
         return new if new.frame_velocity is None else replace(new, frame_velocity=torch.where(stays, 0.0, new.frame_velocity))
@@ -501,14 +502,14 @@ class LearnedSimulator(nn.Module):
         """Return the speed [m/s] below which static friction keeps nodes in place."""
         return self.static_friction * self.builder.metadata.frame_dt * gravity.norm()
 
-    def supported(self, graph: HeteroData) -> Tensor:
-        """Return a mask [island] of the islands that static friction may keep in place. Features must not be standardised."""
+    def supported(self, graph: HeteroData, others: Iterable[tuple[Tensor, Tensor]] = ()) -> Tensor:
+        """Return a mask [island] of the islands that static friction may keep in place, given contacts besides walls. Features must not be standardised."""
         spec = self.builder.spec
         vel = graph[BOUNDARY].x[:, : spec.dim]
         moves = (vel != 0).any(dim=1)
         walls = [relation for relation in spec.relations if relation[0] == BOUNDARY]
         edges = [(graph[relation].edge_index, graph[relation[2]].island) for relation in walls]
-        return supported(graph.island_is_free, [(island[i], moves[j]) for (j, i), island in edges])
+        return supported(graph.island_is_free, [*others, *((island[i], moves[j]) for (j, i), island in edges)])
 
     def advance(self, state: State, acc: Tensor) -> State:
         """Return the next state under an acceleration [node, dim] in m/s² that includes gravity, without static friction. Rigid bodies keep their shape."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.static_friction import supported
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.system.compiled import unfused
+from gpe_pl.trajectory.loads import Loads
+from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.state import State
 from tests import scenes
 
@@ -147,6 +150,36 @@ def test_a_wall_that_moves_holds_nothing() -> None:
     learned.static_friction = ENOUGH
     assert torch.equal(learned.step(moving).pos, free.pos)
     assert not torch.equal(learned.step(state.to_torch()).pos[lies], free.pos[lies])
+
+
+def given_motion(kind: str, state: State, chosen: np.ndarray, speed: float, dt: float) -> State:
+    """Return a state in which some nodes move upwards with a speed [m/s], in an opening around them or on a given path."""
+    if kind == "opening":
+        pos = state.pos[chosen]
+        low, high = (tuple(corner.tolist()) for corner in (pos.min(axis=0) - 0.01, pos.max(axis=0) + 0.01))
+        return state.opened([Opening(low, high, "y_low", speed)])
+    prescribed = np.repeat(chosen[:, None], 2, axis=1)
+    return replace(state, loads=Loads(prescribed, state.pos[chosen] + np.array([0.0, speed * dt]) * np.arange(2)[:, None, None]))
+
+
+@pytest.mark.parametrize("kind", ["opening", "path"])
+@pytest.mark.parametrize("is_compiled", [True, False])
+def test_what_moves_from_outside_holds_nothing(kind: str, is_compiled: bool) -> None:
+    """One node moves slowly, lying on the floor or flying; the others of its island move as without static friction."""
+    state, lies = lying_and_flying()
+    learned = simulator()
+    dt = learned.builder.metadata.frame_dt
+    with nullcontext() if is_compiled else unfused():
+        for of_island in (lies, ~lies):
+            chosen = np.arange(24) == np.flatnonzero(of_island)[0]
+            for speed in (1e-4, 0.0):
+                moving = given_motion(kind, state, chosen, speed, dt).to_torch()
+                learned.static_friction = 0.0
+                free = learned.step(moving)
+                learned.static_friction = ENOUGH
+                found = (learned.step(moving).pos == free.pos).all(dim=1).numpy()
+                holds = lies & ~chosen if speed == 0.0 or of_island[~lies].any() else np.zeros(24, bool)
+                assert (found[~chosen] == ~holds[~chosen]).all(), (of_island, speed)
 
 
 def test_islands_that_touch_walls_none_of_which_moves() -> None:
