@@ -214,7 +214,7 @@ def test_the_mouse_says_at_least_where_a_stored_value_is_cut(opened: Any) -> Non
         """Return what the tooltips of nodes say about the speed."""
         viewer.page.locator("#frame").fill(str(frame))
         found = []
-        for row, column in viewer.colored(0)[::40]:
+        for row, column in viewer.colored(0)[::10]:
             viewer.page.mouse.move(float(column), float(row + stage["y"]))
             found += [line.strip() for line in viewer.page.locator("#tooltip").inner_text().splitlines() if "speed" in line]
         return found
