@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from gpe_pl.schema import node_code
+from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import Stress
 from gpe_pl.trajectory.trajectory import Termination, Trajectory
 from gpe_pl.viz.coloring import MATERIAL_COLORS
@@ -221,6 +222,16 @@ def test_the_mouse_says_at_least_where_a_stored_value_is_cut(opened: Any) -> Non
 
     assert {text.startswith("speed ≥") for text in speeds(8)} == {False, True}
     assert {text.startswith("speed ≥") for text in speeds(7)} == {False}
+
+
+def test_walls_that_move_have_no_error(opened: Any) -> None:
+    truth = falling(2)
+    wall = np.array([[0.3, 0.05], [0.4, 0.05]]) + 0.01 * np.arange(truth.num_frames)[:, None, None]
+    moving = Boundary.moving(wall, np.array([[0.0, 1.0]] * 2), truth.metadata.frame_dt)
+    viewer = opened(replace(truth, boundary=moving), GPE=replace(falling(2, noise=0.3), boundary=moving))
+    shades = viewer.page.evaluate("Array.from(window.viewer.shades[2])")
+    assert len(shades) == truth.num_nodes + 2
+    assert min(shades[:-2]) >= 0 and shades[-2:] == [-1, -1]
 
 
 @pytest.fixture(params=[2, 3], ids=["2d", "3d"])
