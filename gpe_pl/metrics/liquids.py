@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from gpe_pl.schema import node_code
@@ -56,14 +56,8 @@ def volume(pos: Float[np.ndarray, "node dim"], metadata: Metadata) -> float:
     space, edge, dim = metadata.periodicity, metadata.spacing, metadata.dim
     step = {2: 1.32471795724474602596, 3: 1.22074408460575947536}[dim] ** -np.arange(1.0, dim + 1)
     shifts = edge * ((0.5 + step * np.arange(1, NUM_GRIDS + 1)[:, None]) % 1)
-    counts = [_num_boxes(np.floor((space.from_corner(pos + shift) if space else pos + shift) / edge).astype(np.int64)) for shift in shifts]
+    counts = [len(np.unique(np.floor((space.from_corner(pos + shift) if space else pos + shift) / edge), axis=0)) for shift in shifts]
     return float(np.mean(counts) * edge**dim)
-
-
-def _num_boxes(boxes: Int64[np.ndarray, "node dim"]) -> int:
-    """Return the number of different boxes."""
-    boxes = boxes - boxes.min(axis=0)
-    return len(np.unique(np.ravel_multi_index(tuple(boxes.T), tuple(boxes.max(axis=0) + 1))))
 
 
 def liquid_metrics(

@@ -82,3 +82,8 @@ def test_moves_of_the_whole_liquid_by_parts_of_a_spacing_leave_its_volume(dim: i
     metadata = replace(METADATA, bounds=((0.0, 3.0),) * dim, gravity=(0.0,) * (dim - 1) + (-9.81,))
     found = [volume(pool + shift * SPACING, metadata) for shift in (0.0, 0.1, 0.25, 0.4, 0.5, 0.7)]
     assert np.ptp(found) < 0.02 * np.mean(found)
+
+
+def test_nodes_that_flew_far_apart_have_a_volume() -> None:
+    metadata = replace(METADATA, bounds=((0.0, 3.0),) * 3, gravity=(0.0, 0.0, -9.81))
+    assert volume(np.array([[0.0, 0.0, 0.0], [1e9, -1e9, 1e9]]), metadata) == pytest.approx(2 * SPACING**3)
