@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from pydantic import Field
 
 from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
-from gpe_pl.benchmarks.trained import Case, checkpoint_label, fingerprint_of, of_stored_frames
+from gpe_pl.benchmarks.trained import Case, checkpoint_label, fingerprint_of, of_stored_frames, refuse_same_names
 from gpe_pl.data.ground_truth import DatasetSpec, initial_state, parameter_values, trajectory_metadata
 from gpe_pl.errors import GpeError
 from gpe_pl.files.markdown import table_row
@@ -70,14 +70,13 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
     """Return a record per scene and simulator, and Markdown tables.
 
     Raises:
-        ChannelError: a scene is not open, the solver stopped, or two checkpoints have the same name.
+        ChannelError: a scene is not open, or the solver stopped.
+        SameNameError: two checkpoints have the same name.
         CheckpointError: a checkpoint cannot be read. The records of those before it are kept for the next run.
     """
     parts, records = FinishedParts(folder / PARTS), list[dict[str, Any]]()
     names = [SOLVER, CONTROL, *settings.checkpoints]
-    labels = [checkpoint_label(name) for name in settings.checkpoints]
-    if twice := next((label for label in labels if labels.count(label) > 1), None):
-        raise ChannelError(f"two checkpoints are called {twice}; copy one of them to a file of another name")
+    refuse_same_names(settings.checkpoints)
     with progress_bar("simulators") as on_progress:
         for case, spec in specs.items():
             places: list[Place] = [(split, k) for split, count in settings.scenes.items() for k in range(min(count, spec.counts[split]))]

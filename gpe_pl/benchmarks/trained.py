@@ -147,6 +147,21 @@ def trained_on(
     return found
 
 
+class SameNameError(GpeError, ValueError):
+    """Raised when two checkpoints of a suite have one name, because reports tell models apart by their names; the message has the name."""
+
+
+def refuse_same_names(checkpoints: Sequence[str]) -> None:
+    """Do nothing if all models of a suite have different labels (``checkpoint_label``).
+
+    Raises:
+        SameNameError: two have the same.
+    """
+    labels = [checkpoint_label(checkpoint) for checkpoint in checkpoints]
+    if twice := next((label for label in labels if labels.count(label) > 1), None):
+        raise SameNameError(f"two checkpoints are called {twice}; copy one of them to a file of another name")
+
+
 def checkpoint_label(checkpoint: str) -> str:
     """Return a short name for a model that is given as the path of a checkpoint, the folder of a run, or the name of a shipped model."""
     path = Path(checkpoint)

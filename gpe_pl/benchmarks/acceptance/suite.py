@@ -19,7 +19,7 @@ from pydantic import Field
 from gpe_pl.benchmarks.acceptance import bodies, flight, liquid, particles
 from gpe_pl.benchmarks.acceptance.trial import Candidate, Result
 from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
-from gpe_pl.benchmarks.trained import Case, checkpoint_label, of_stored_frames
+from gpe_pl.benchmarks.trained import Case, checkpoint_label, of_stored_frames, refuse_same_names
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.errors import GpeError
 from gpe_pl.files.markdown import table_row
@@ -48,7 +48,7 @@ SCENES: dict[str, dict[str, Callable[[Candidate], Result]]] = {
 
 
 class AcceptanceError(GpeError, ValueError):
-    """Raised when there are no acceptance scenes for a checkpoint, or two have one name; the message names them."""
+    """Raised when there are no acceptance scenes for a checkpoint, or it was replaced while the suite ran; the message names it."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
     The results of each checkpoint are written to ``folder``, and beside the checkpoint unless it is a shipped model.
 
     Raises:
-        AcceptanceError: there are no acceptance scenes for a checkpoint, two checkpoints have one name, or one was replaced while the suite ran.
+        AcceptanceError: there are no acceptance scenes for a checkpoint, or it was replaced while the suite ran.
+        SameNameError: two checkpoints have the same name.
     """
     torch.set_num_threads(settings.num_threads)
     candidates = _candidates(settings.checkpoints, specs)
@@ -93,10 +94,11 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
 
 def _candidates(checkpoints: Sequence[str], specs: dict[str, DatasetSpec]) -> list[tuple[Candidate, Path, str]]:
     """Return the models with the paths and checksums of their checkpoints, all loaded first, so that a wrong name is reported at once."""
-    found: dict[str, tuple[Candidate, Path, str]] = {}
+    found = []
+    refuse_same_names(checkpoints)
     for checkpoint in checkpoints:
         checksum = verdicts.checksum(checkpoint_path(checkpoint))
-        simulator, name = of_stored_frames(checkpoint), checkpoint_label(checkpoint)
+        simulator = of_stored_frames(checkpoint)
         own = simulator.builder.metadata
         fitting = [s for s in specs.values() if s.name == own.dataset and abs(s.scene.spacing / own.spacing - 1) < 0.01]
         if not fitting or len(own.materials) > 1:
@@ -104,10 +106,8 @@ def _candidates(checkpoints: Sequence[str], specs: dict[str, DatasetSpec]) -> li
                 f"{checkpoint}: was trained on {own.dataset} ({', '.join(own.materials)}, spacing {own.spacing:g} m); acceptance scenes are for one material "
                 f"in {', '.join(f'{s.name} {s.size} ({s.scene.spacing:g} m)' for s in specs.values())}; choose its size=… or add a data set to suite.cases"
             )
-        if name in found:
-            raise AcceptanceError(f"two checkpoints are called {name}; copy one of them to a file of another name")
-        found[name] = Candidate(name, simulator, fitting[0]), checkpoint_path(checkpoint), checksum
-    return list(found.values())
+        found.append((Candidate(checkpoint_label(checkpoint), simulator, fitting[0]), checkpoint_path(checkpoint), checksum))
+    return found
 
 
 def _scenes(candidate: Candidate) -> list[str]:

@@ -19,7 +19,7 @@ from gpe_pl.benchmarks.learning_sets.sets import SETS
 from gpe_pl.benchmarks.outside import engines, experiments
 from gpe_pl.benchmarks.outside.engines import EngineName
 from gpe_pl.benchmarks.outside.experiments import DAM_BREAK_FILE, Experiment, OutsideError
-from gpe_pl.benchmarks.trained import Case, checkpoint_label, of_stored_frames
+from gpe_pl.benchmarks.trained import Case, checkpoint_label, of_stored_frames, refuse_same_names
 from gpe_pl.data.ground_truth import DatasetSpec
 
 if TYPE_CHECKING:
@@ -61,15 +61,14 @@ def run(settings: Settings, specs: Mapping[str, DatasetSpec], own: Path) -> tupl
         own: folder of the suite's results. What ``suite=learning_sets`` has measured in the folder beside it is reported, too.
 
     Raises:
-        OutsideError: a checkpoint was trained on none of ``specs``, two have the same name, or a file of the user cannot be read.
+        OutsideError: a checkpoint was trained on none of ``specs``, or a file of the user cannot be read.
+        SameNameError: two checkpoints have the same name.
         EngineError: an engine failed.
     """
     torch.set_num_threads(settings.num_threads)
     folder = Path(settings.folder).expanduser()
+    refuse_same_names(settings.checkpoints)
     candidates = [candidate_of(checkpoint, specs) for checkpoint in settings.checkpoints]
-    names = [candidate.name for candidate in candidates]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise OutsideError(f"two checkpoints are called {twice}; copy one of them to a file of another name")
     records = [record for name in settings.experiments for c in candidates for record in experiments.compared(name, c, folder)]
     present = [name for name in settings.engines if not engines.SCENES[name].is_missing()]
     records += [record for name in present for c in candidates for record in engines.compared(name, c)]

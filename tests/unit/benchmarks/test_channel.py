@@ -11,7 +11,7 @@ import pytest
 
 from gpe_pl.benchmarks import channel
 from gpe_pl.benchmarks.channel import CONTROL, SOLVER, ChannelError, Settings, errors, figures, measured, report
-from gpe_pl.benchmarks.trained import Case
+from gpe_pl.benchmarks.trained import Case, SameNameError
 from gpe_pl.config.datasets import dataset
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.rollout.baselines import ConstantVelocity
@@ -88,7 +88,7 @@ def test_data_without_inlet_are_refused() -> None:
 def test_models_of_one_name_are_refused(tmp_path: Path) -> None:
     spec = dataset("data=channel", "size=tiny", "dimension=2")
     settings = Settings([str(tmp_path / "old" / "sand"), str(tmp_path / "new" / "sand")], {"channel": Case([])}, {"test": 1}, 0.1)
-    with pytest.raises(ChannelError, match="two checkpoints are called sand; copy one of them to a file of another name"):
+    with pytest.raises(SameNameError, match="two checkpoints are called sand; copy one of them to a file of another name"):
         channel.run(settings, {"channel": spec}, tmp_path)
 
 

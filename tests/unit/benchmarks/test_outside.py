@@ -22,6 +22,7 @@ from gpe_pl.benchmarks.outside.experiments import (
     report,
     run_out,
 )
+from gpe_pl.benchmarks.trained import SameNameError
 from gpe_pl.config.datasets import dataset
 from gpe_pl.learned.pretrained import checkpoint_path
 
@@ -114,5 +115,5 @@ def test_models_of_one_name_are_refused(tmp_path: Path) -> None:
         shutil.copy(checkpoint_path("sand"), tmp_path / folder / "sand.ckpt")
     checkpoints = [str(tmp_path / folder / "sand.ckpt") for folder in ("old", "new")]
     settings = suite.Settings({}, checkpoints=checkpoints)
-    with pytest.raises(OutsideError, match="two checkpoints are called sand; copy one of them to a file of another name"):
+    with pytest.raises(SameNameError, match="two checkpoints are called sand; copy one of them to a file of another name"):
         suite.run(settings, {"sand": dataset("data=sand", "size=small")}, tmp_path)

@@ -14,6 +14,7 @@ from gpe_pl.benchmarks.acceptance import particles, scenes, suite
 from gpe_pl.benchmarks.acceptance.suite import AcceptanceError, Settings, failures, run
 from gpe_pl.benchmarks.acceptance.trial import Candidate, Result, Trial, TrialError, at_most, contained, shown, tried
 from gpe_pl.benchmarks.half_steps import HalfSteps
+from gpe_pl.benchmarks.trained import SameNameError
 from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec, trajectory_metadata
 from gpe_pl.graphs.builder import GraphBuilder
@@ -125,7 +126,7 @@ def test_a_model_that_stops_has_no_containment_to_judge(spec: DatasetSpec, check
 def test_a_model_without_scenes_and_two_of_one_name_are_refused(spec: DatasetSpec, checkpoint: Path, tmp_path: Path) -> None:
     with pytest.raises(AcceptanceError, match=r"best.ckpt: was trained on sand \(sand, spacing .*choose its size="):
         run(Settings({}, [str(checkpoint)]), {"sand": dataset("data=sand", "size=small")}, tmp_path)
-    with pytest.raises(AcceptanceError, match="two checkpoints are called own"):
+    with pytest.raises(SameNameError, match="two checkpoints are called own"):
         run(Settings({}, [str(checkpoint)] * 2), {"sand": spec}, tmp_path)
 
 
