@@ -28,7 +28,7 @@ from gpe_pl.benchmarks.reference_solutions import REFERENCES, ComparisonError, s
 from gpe_pl.benchmarks.runtime_vs_error import Entrant, Settings, _entrants, compare, figures, run
 from gpe_pl.benchmarks.solver_rungs import DATA, NODES
 from gpe_pl.benchmarks.spent_before import Simulated, Spent
-from gpe_pl.benchmarks.timed_rollouts import Start, timed
+from gpe_pl.benchmarks.timed_rollouts import Start, distance, squared_error, timed
 from gpe_pl.benchmarks.trained import Case, Labels
 from gpe_pl.config.datasets import dataset, dataset_spec
 from gpe_pl.data.ground_truth import generate_trajectory, initial_state, trajectory_metadata
@@ -40,7 +40,9 @@ from gpe_pl.models.gpe import GPE
 from gpe_pl.reports.finished_runs import Run, table_of
 from gpe_pl.rollout.baselines import ConstantVelocity
 from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.solvers.resolution import Resolved
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests.runs import compose
 
@@ -201,6 +203,29 @@ def test_models_of_finer_labels_start_where_the_solver_at_their_own_spacing_is(m
     np.testing.assert_allclose(np.asarray(at.resolved.state.pos), plain.pos[2])
     assert not np.allclose(plain.pos[2], generate_trajectory(spec, "test_unseen", 0, num_frames=3).pos[2])
     assert by_name["model"].seconds == pytest.approx([0.5 + 0.5 * 2 / 23])  # two of 23 steps are the solver's
+
+
+@pytest.mark.parametrize("num_good_steps", [1, 5])
+def test_a_solver_that_stops_is_infinitely_wrong_from_there_on(num_good_steps: int) -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    data, start = generate_trajectory(spec, "test", 0), initial_state(spec, "test", 0)
+    flight = ConstantVelocity(data.metadata.frame_dt)
+
+    class Stopping:
+        def __init__(self) -> None:
+            self.num_steps = -1  # ``timed`` repeats the first step
+
+        def step(self, state: State) -> State:
+            self.num_steps += 1
+            if self.num_steps > num_good_steps:
+                raise SimulationError("stopped")
+            return flight.step(state)
+
+    prediction, _ = timed(Stopping(), Start(Resolved(start, lambda pos: pos), True), data, 3)
+    error = squared_error(prediction, data.frames(3))
+    num_good = max(1, num_good_steps + 1 - 3)  # before frame 3, the frame before the stop takes the place of the start
+    assert np.isfinite(error[:num_good]).all() and np.isinf(error[num_good:]).all() and len(error) == data.num_frames - 3
+    assert np.isinf(distance(prediction, data.frames(3)))
 
 
 def test_longer_steps_are_as_many_frames_and_what_lies_between_is_interpolated() -> None:
