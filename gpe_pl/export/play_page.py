@@ -101,7 +101,7 @@ def check_film(metadata: Metadata, trajectory: Trajectory) -> None:
             raise PageError(
                 f"the scene has {name}={list(other)}, a page has that of the model, {list(own)}; leave this scene, or the page, out"
             )
-    check_boundary(trajectory.boundary)
+    check_boundary(trajectory.boundary, metadata.spacing)
 
 
 def _scene(simulator: LearnedSimulator, film: SolverFilm) -> dict[str, Any]:
@@ -109,7 +109,8 @@ def _scene(simulator: LearnedSimulator, film: SolverFilm) -> dict[str, Any]:
     builder, first = simulator.builder, simulator.builder.config.history
     trajectory = film.trajectory
     check_film(builder.metadata, trajectory)
-    start = state_for_page(simulator.initial_state(trajectory, first), builder.metadata.columns_of(builder.spec.materials[0]))
+    columns = builder.metadata.columns_of(builder.spec.materials[0])
+    start = state_for_page(simulator.initial_state(trajectory, first), columns, builder.metadata.spacing)
     low, high = np.asarray(builder.metadata.bounds, float).T
     place = (trajectory.pos[first:].astype(np.float64) - low) / (high - low)
     levels = np.round(LEVELS * np.clip(place, 0, 1)).astype("<u2")

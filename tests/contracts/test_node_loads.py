@@ -369,7 +369,7 @@ def test_exported_scenes_have_no_loads() -> None:
     """A program would leave prescribed nodes to the model."""
     made = simulator(beam(forced=False, held=False))
     state = beam(forced=False).state(2, made.builder.config.history).to_torch()
-    for refuses in (lambda: scene_of(made, state), lambda: state_for_page(state, [0])):
+    for refuses in (lambda: scene_of(made, state), lambda: state_for_page(state, [0], 0.1)):
         with pytest.raises(NodeLoadError, match="no prescribed nodes and no forces"):
             refuses()
 

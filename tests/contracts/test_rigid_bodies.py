@@ -146,7 +146,7 @@ def test_exported_programs_and_pages_refuse_rigid_bodies(tmp_path: Path) -> None
     with pytest.raises(RigidBodyError, match="do not move rigid bodies as a whole, and this scene has 2"):
         scene_of(simulator, start)
     with pytest.raises(RigidBodyError):
-        state_for_page(start, [0])
+        state_for_page(start, [0], truth.metadata.spacing)
     write_shard(tmp_path / "test" / "shard-00000.h5", [truth])
     with pytest.raises(RigidBodyError, match=r"leave model and page out of evaluation\.export"):
         evaluate(simulator, tmp_path, EvaluationSettings(["test"], num_pictures=0, export=["model"]), tmp_path / "run")

@@ -94,7 +94,7 @@ def in_javascript(simulator: LearnedSimulator, states: list[State], num: int, pl
         "parts": PARTS.as_uri(),
         "model": model,
         "weights": base64.b64encode(numbers.tobytes()).decode(),
-        "states": [state_for_page(state, [0]) for state in states],
+        "states": [state_for_page(state, [0], simulator.builder.metadata.spacing) for state in states],
         "num": num,
         "plain": plain,
     }
@@ -180,22 +180,25 @@ def test_pages_refuse_what_they_would_compute_otherwise() -> None:
         with pytest.raises(PageError, match=message):
             model_for_page(simulator)
     simulator = LearnedSimulator.from_checkpoint("sand")
-    state = scene(simulator, (FLOOR,))
+    state, spacing = scene(simulator, (FLOOR,)), simulator.builder.metadata.spacing
     points = replace(state, boundary=replace(state.boundary, shapes=()))
     with pytest.raises(PageError, match="boundary has points only"):
-        state_for_page(points, [0])
+        state_for_page(points, [0], spacing)
     walls = state.boundary
     longer: dict[str, Any] = {name: torch.cat([x, x[:1]]) for name, x in vars(walls).items() if isinstance(x, torch.Tensor)}
     longer["pos"][-1] += 0.2
     ledge = replace(walls, **longer)
     with pytest.raises(PageError, match="some of its nodes are on none of them"):
-        state_for_page(replace(state, boundary=ledge), [0])
+        state_for_page(replace(state, boundary=ledge), [0], spacing)
     slippery = replace(walls, friction=0.1 * walls.friction)
     with pytest.raises(PageError, match=r"boundary_node \d+ has the friction .*, the shape there .*; give both the same"):
-        state_for_page(replace(state, boundary=slippery), [0])
+        state_for_page(replace(state, boundary=slippery), [0], spacing)
     moving = replace(state, boundary=replace(state.boundary, vel=state.boundary.vel + 1.0))
     with pytest.raises(PageError, match="walls and obstacles that stand still"):
-        state_for_page(moving, [0])
+        state_for_page(moving, [0], spacing)
+    for other in (Boundary.sample((FLOOR,), 2 * spacing, 2), replace(Boundary.sample((FLOOR,), spacing, 2), restitution=np.full(len(walls.pos), 0.5))):
+        with pytest.raises(PageError, match=r"pages have boundary nodes 0.0\d+ m apart on all walls and obstacles, and this scene has others"):
+            state_for_page(replace(state, boundary=other), [0], spacing)
     own = simulator.builder.metadata
     film = rollout(Contained(simulator, own.frame_dt), state, 2, own)
     check_film(own, film)

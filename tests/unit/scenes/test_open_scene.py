@@ -147,7 +147,7 @@ def test_exported_programs_and_pages_refuse_openings() -> None:
     with pytest.raises(OpenSceneError, match=message):
         scene_of(model(), model().standing(state, metadata))
     with pytest.raises(OpenSceneError, match=message):
-        state_for_page(state, [0])
+        state_for_page(state, [0], metadata.spacing)
 
 
 def test_a_scene_file_has_openings(tmp_path: Path) -> None:
