@@ -12,10 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from gpe_pl.errors import GpeError
-from gpe_pl.export.onnx_network import tolerance
-from gpe_pl.export.program import export_model, scene_of
+from gpe_pl.export.agreement import excess, largest_difference
+from gpe_pl.export.program import EVERYTHING, export_model, scene_of
 from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.state import State
@@ -25,7 +26,7 @@ INDUCTOR = {"aot_inductor.precompile_headers": False}
 
 
 class CompiledProgramError(GpeError):
-    """Raised when a compiled program moves nodes elsewhere than its model."""
+    """Raised when a compiled program moves nodes elsewhere than its model, or stresses them otherwise."""
 
 
 def export_compiled(simulator: LearnedSimulator, path: Path | str, states: Sequence[State]) -> float:
@@ -40,7 +41,8 @@ def export_compiled(simulator: LearnedSimulator, path: Path | str, states: Seque
         The largest difference of a position after these steps [m].
 
     Raises:
-        CompiledProgramError: the compiled program moves a node elsewhere, by more than ``onnx_network.tolerance``; nothing is written.
+        CompiledProgramError: the compiled program moves a node elsewhere or stresses it otherwise, by more than ``agreement.excess`` allows; nothing is
+            written.
         ValueError: ``path`` has another file type, or there are no states.
         CellError, MirrorAverageError, LeastDistanceError, NodeLoadError, RigidBodyError, OpenSceneError: as ``export_model`` and ``scene_of`` raise them.
     """
@@ -55,14 +57,23 @@ def export_compiled(simulator: LearnedSimulator, path: Path | str, states: Seque
         inductor = torch._inductor
         inductor.aoti_compile_and_package(torch.export.load(plain), package_path=str(compiled), inductor_configs=INDUCTOR)
         step = inductor.aoti_load_package(str(compiled))
-        found = 0.0
+        positions, stresses = list[tuple[Tensor, Tensor]](), list[tuple[Tensor, Tensor]]()
         for state, scene in zip(states, scenes, strict=True):
-            moved, expected = step(scene)[0], scene_of(simulator, simulator.step(state))
-            found = max(found, *(float((moved[name] - expected[name]).abs().max()) for name in moved if name.startswith("pos.")))
-        allowed = tolerance(states)
-        if not found <= allowed:
-            raise CompiledProgramError(
-                f"one step of the compiled program differs from that of the model by {found:.3g} m, at most {allowed:.3g} m are allowed"
-            )
+            moved, predicted = step(scene)
+            expected = _positions_and_stresses(simulator, state)
+            positions += [(values, expected[name]) for name, values in moved.items() if name.startswith("pos.")]
+            stresses += [(values, expected[name]) for name, values in predicted.items() if name.startswith("stress.")]
+        position = largest_difference(positions)
+        if wrong := excess(position, largest_difference(stresses), states, simulator.stress_std):
+            raise CompiledProgramError(f"one step of the compiled program differs from that of the model {wrong}")
         replace_bytes(Path(path), compiled.read_bytes())
+    return position
+
+
+def _positions_and_stresses(simulator: LearnedSimulator, state: State) -> dict[str, Tensor]:
+    """Return positions and stresses after a step of the simulator by the names that programs give them."""
+    rows, new = simulator.builder.topology(state).rows, simulator.configured(skips=EVERYTHING).step(state)
+    found = {f"pos.{material}": new.pos[r] for material, r in rows.items()}
+    if new.stress is not None:
+        found |= {f"stress.{material}": new.stress.node[r] for material, r in rows.items()}
     return found

@@ -27,17 +27,13 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from gpe_pl.errors import GpeError
+from gpe_pl.export.agreement import excess, largest_difference
 from gpe_pl.export.program import EVERYTHING
 from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.models.gpe_program_runner import Decoded
 from gpe_pl.trajectory.state import State
-
-TOLERANCE = 1e-6
-"""Largest difference of a position after one step [m], in scenes whose coordinates are so small that rounding is smaller (see ``tolerance``)."""
-ROUNDINGS = 4
-"""Number of roundings of the largest coordinate by which a position may differ."""
 
 Arguments = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor], dict[str, Tensor], dict[Any, tuple[Tensor, Tensor, Tensor]]]
 """Arguments of ``GPE.compute``."""
@@ -153,15 +149,12 @@ def simulator_of(simulator: LearnedSimulator, content: bytes) -> LearnedSimulato
     return _with_compute(simulator, compute)
 
 
-def difference(simulator: LearnedSimulator, other: LearnedSimulator, states: Sequence[State]) -> float:
-    """Return the largest difference of a position [m] between one step of two simulators from each of some states."""
-    return max(float((simulator.step(s).pos - other.step(s).pos).abs().max()) for s in states)
-
-
-def tolerance(states: Sequence[State]) -> float:
-    """Return the largest difference of a position that is allowed after one step from these states [m]."""
-    largest = max(float(state.pos.abs().max()) for state in states)
-    return max(TOLERANCE, ROUNDINGS * torch.finfo(torch.float32).eps * largest)
+def differences(simulator: LearnedSimulator, other: LearnedSimulator, states: Sequence[State]) -> tuple[float, float]:
+    """Return the largest differences of a position [m] and of a stress [Pa] between one step of two simulators from each of some states."""
+    complete = simulator.configured(skips=EVERYTHING)
+    pairs = [(complete.step(state), other.step(state)) for state in states]
+    stresses = [(a.stress.node, b.stress.node) for a, b in pairs if a.stress is not None and b.stress is not None]
+    return largest_difference((a.pos, b.pos) for a, b in pairs), largest_difference(stresses)
 
 
 def check_network(simulator: LearnedSimulator) -> None:
@@ -182,7 +175,8 @@ def export_network(simulator: LearnedSimulator, path: Path | str, states: Sequen
         The largest difference of a position after these steps [m].
 
     Raises:
-        OnnxError: the model is no GPE, or the exported network moves a node elsewhere, by more than ``tolerance``; nothing is written.
+        OnnxError: the model is no GPE, or the exported network moves a node elsewhere or stresses it otherwise, by more than ``agreement.excess`` allows;
+            nothing is written.
         ValueError: ``path`` has another file type, or there are no states.
     """
     path = Path(path)
@@ -192,11 +186,8 @@ def export_network(simulator: LearnedSimulator, path: Path | str, states: Sequen
         raise ValueError("states: give at least one, in which the exported network is compared with the model")
     check_network(simulator)
     content = _program(simulator, _arguments(simulator, states[0]))
-    found, allowed = difference(simulator, simulator_of(simulator, content), states), tolerance(states)
-    if not found <= allowed:
-        raise OnnxError(
-            f"one step of the exported network differs from that of the model by {found:.3g} m, at most {allowed:.3g} m are allowed; "
-            "leave onnx out of evaluation.export"
-        )
+    position, stress = differences(simulator, simulator_of(simulator, content), states)
+    if wrong := excess(position, stress, states, simulator.stress_std):
+        raise OnnxError(f"one step of the exported network differs from that of the model {wrong}; leave onnx out of evaluation.export")
     replace_bytes(path, content)
-    return found
+    return position

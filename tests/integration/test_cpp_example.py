@@ -58,7 +58,8 @@ def test_the_example_moves_particles_as_python_does(tmp_path: Path) -> None:
     assert np.abs(free.pos - expected.pos).max() > 0.01
 
 
-def test_a_compiled_program_that_differs_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("moved_by", [1.0, np.nan])
+def test_a_compiled_program_that_differs_is_not_written(moved_by: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     learned = simulator(config={"history": 2})
     state = scenes.state(history=2).to_torch()
 
@@ -69,7 +70,7 @@ def test_a_compiled_program_that_differs_is_not_written(tmp_path: Path, monkeypa
 
         @staticmethod
         def aoti_load_package(path: str) -> object:
-            return lambda scene: ({"pos.sand": scene["pos.sand"] + 1.0}, {})
+            return lambda scene: ({"pos.sand": scene["pos.sand"] + moved_by}, {})
 
     monkeypatch.setattr(torch, "_inductor", Inductor)
     monkeypatch.setattr(torch.export, "load", lambda _: None)

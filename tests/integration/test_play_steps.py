@@ -196,8 +196,13 @@ def test_pages_refuse_what_they_would_compute_otherwise() -> None:
     moving = replace(state, boundary=replace(state.boundary, vel=state.boundary.vel + 1.0))
     with pytest.raises(PageError, match="walls and obstacles that stand still"):
         state_for_page(moving, [0], spacing)
-    for other in (Boundary.sample((FLOOR,), 2 * spacing, 2), replace(Boundary.sample((FLOOR,), spacing, 2), restitution=np.full(len(walls.pos), 0.5))):
-        with pytest.raises(PageError, match=r"pages have boundary nodes 0.0\d+ m apart on all walls and obstacles, and this scene has others"):
+    for other in (
+        Boundary.sample((FLOOR,), 2 * spacing, 2),
+        replace(Boundary.sample((FLOOR,), spacing, 2), restitution=np.full(len(walls.pos), 0.5)),
+    ):
+        with pytest.raises(
+            PageError, match=r"pages have boundary nodes 0.0\d+ m apart on all walls and obstacles, and this scene has others"
+        ):
             state_for_page(replace(state, boundary=other), [0], spacing)
     own = simulator.builder.metadata
     film = rollout(Contained(simulator, own.frame_dt), state, 2, own)
