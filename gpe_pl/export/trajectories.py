@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import math
+import re
 import shutil
 import zlib
 from collections.abc import Iterator, Mapping
@@ -29,6 +30,9 @@ from gpe_pl.trajectory.state import von_mises
 from gpe_pl.trajectory.store import PREDICTION, stored_arrays, stored_attributes
 from gpe_pl.trajectory.trajectory import Trajectory
 
+BOUNDARY = "boundary.vtu"
+OWN_FILE = re.compile(r"frame_\d{5,}\.vtu|" + re.escape(BOUNDARY))
+"""Names of the files in the folder of a series."""
 VERTEX = 1
 CELL_TYPES = {"line": 3, "triangle": 5, "quadrilateral": 9, "tetrahedron": 10, "wedge": 13, "hexahedron": 12}
 """VTK's codes for kinds of cells."""
@@ -64,6 +68,8 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     have ``displacement`` from rest [m], ``error`` (distance from the ground truth [m], NaN for nodes that it does not have in that frame), ``stress`` [Pa] and
     ``von_mises`` [Pa]. Cells have the last two as well, NaN on particles. Moving boundary nodes are points like others; ``boundary.vtu`` has the rest, with
     ``normal``, ``friction`` and ``restitution``.
+
+    An earlier series at this path is replaced: those of its files that the new one does not have are removed.
 
     In an open scene, each file has the nodes that are in the scene in its frame, with their numbers as ``node``.
 
@@ -110,7 +116,7 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     mesh = np.empty((0, 3), np.int64) if trajectory.cells is None else trajectory.cells.astype(np.int64)
     edges = cell_edges(mesh, trajectory.num_nodes)
     moved = _displacements(trajectory, edges)
-    entries = []
+    entries, written = [], set[str]()
     with _whole(folder):
         for frame in range(0, trajectory.num_frames, stride):
             name = f"frame_{frame:05d}.vtu"
@@ -122,13 +128,18 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
             if trajectory.alive is not None:
                 pos, cells, points = _living(trajectory, frame, pos, points)
             replace_text(folder / name, _grid(pos, cells, points, in_cells))
+            written.add(name)
             time = frame * trajectory.metadata.frame_dt
             entries.append(f'<DataSet timestep="{time:.9g}" part="0" file={quoteattr(f"{folder.name}/{name}")}/>')
         boundary = trajectory.boundary
         if len(boundary.pos):
             data = {"normal": _in_3d(boundary.normal), "friction": boundary.friction, "restitution": boundary.restitution}
-            replace_text(folder / "boundary.vtu", _grid(boundary.pos, _vertices(np.arange(len(boundary.pos))), data, {}))
+            replace_text(folder / BOUNDARY, _grid(boundary.pos, _vertices(np.arange(len(boundary.pos))), data, {}))
+            written.add(BOUNDARY)
         replace_text(path, _document("Collection", "<Collection>\n" + "\n".join(entries) + "\n</Collection>"))
+    for old in folder.glob("*.vtu"):
+        if OWN_FILE.fullmatch(old.name) and old.name not in written:
+            old.unlink()
 
 
 @contextlib.contextmanager

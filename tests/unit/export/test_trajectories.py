@@ -14,9 +14,11 @@ from gpe_pl.export.trajectories import write_npz, write_vtk
 from gpe_pl.rollout.baselines import ConstantVelocity
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import FIELDS, node_code
+from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import Stress
 from gpe_pl.trajectory.store import iter_trajectories, stored_arrays
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+from tests.conftest import make_trajectory
 from tests.unit.viz.conftest import block, falling, falling_mesh
 
 meshio = pytest.importorskip("meshio", reason="meshio, another reader of VTK files, is not installed")
@@ -200,6 +202,15 @@ def test_vtk_itself_reads_it(tmp_path: Path, dim: int) -> None:
     assert [array.GetComponentName(k) for k in range(6)] == ["XX", "YY", "ZZ", "XY", "YZ", "XZ"]
     assert array.GetTuple(0)[0] == mesh.stress.cell[2, 0, 0]
     assert grid.GetPoint(5)[:dim] == tuple(mesh.pos[2, 5])
+
+
+def test_a_new_series_takes_the_place_of_an_earlier_one(tmp_path: Path) -> None:
+    trajectory = make_trajectory(num_frames=5)
+    write_vtk(tmp_path / "series.pvd", trajectory)
+    (tmp_path / "series" / "notes.txt").write_text("of the user")
+    without_walls = replace(trajectory, boundary=Boundary.empty(trajectory.metadata.dim))
+    write_vtk(tmp_path / "series.pvd", without_walls, stride=3)
+    assert sorted(path.name for path in (tmp_path / "series").iterdir()) == ["frame_00000.vtu", "frame_00003.vtu", "notes.txt"]
 
 
 def test_an_archive_holds_what_the_store_holds(tmp_path: Path) -> None:
