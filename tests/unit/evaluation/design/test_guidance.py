@@ -47,7 +47,9 @@ def torch_boundary(own: Boundary) -> Boundary:
     return replace(scenes.state(), boundary=own).to_torch().boundary
 
 
-def test_gradients_equal_finite_differences(guidance: Guidance) -> None:
+@pytest.mark.parametrize("averages", [False, True])
+def test_gradients_equal_finite_differences(guidance: Guidance, averages: bool) -> None:
+    guidance = replace(guidance, simulator=guidance.simulator.configured(mirror_average=averages))
     z, step = np.array([0.6, 0.45, 0.7]), 1e-4
     value, gradient = guidance.misfit_and_gradient(z)
     assert value == pytest.approx(guidance.misfit(z), rel=1e-9)

@@ -224,9 +224,10 @@ def gradients_of(simulator: LearnedSimulator, seen: Trajectory) -> Shooting:
     return shooting(simulator, Observations.of(seen), unknowns, ShootingSettings(horizon=2, num_windows=2))
 
 
-def test_gradients_agree_with_finite_differences() -> None:
+@pytest.mark.parametrize("averages", [False, True])
+def test_gradients_agree_with_finite_differences(averages: bool) -> None:
     simulator, seen = learned()
-    shots = gradients_of(simulator, seen)
+    shots = gradients_of(simulator.configured(mirror_average=averages), seen)
     z, step = 0.7, 1e-4
     value, gradient = shots.misfit_and_gradient([z])
     difference = (shots.misfit([z + step]) - shots.misfit([z - step])) / (2 * step)
