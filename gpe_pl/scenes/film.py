@@ -15,6 +15,7 @@ from gpe_pl.export.trajectories import write_npz
 from gpe_pl.files.destinations import file_fault
 from gpe_pl.files.names import portable
 from gpe_pl.metrics.open_scenes import entering, leaving, ledger
+from gpe_pl.metrics.rollouts import displacement
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.browser import open_page
 from gpe_pl.viz.captions import describe, heading, with_heading
@@ -73,13 +74,13 @@ class Film:
     def distance(self, name: str) -> float:
         """Return the root mean square distance [m] of the nodes of another rollout from those of the first, over the frames that both have.
 
-        It is NaN if they have none after the start in common.
+        Along periodic axes it is that of the nearest images. It is NaN if they have none after the start in common.
 
         Nodes of open scenes are at other places after some time, so there the distance says nothing; compare ``metrics.open_scenes``.
         """
         other = self.others[name]
         count = min(self.first.num_frames, other.num_frames)
-        apart = other.pos[1:count].astype(np.float64) - self.first.pos[1:count]
+        apart = displacement(other.pos[1:count], self.first.pos[1:count], self.first.metadata)
         return float(np.sqrt(np.mean(np.sum(apart**2, axis=-1)))) if count > 1 else math.nan
 
     def write(self, path: Path | str) -> Path:
