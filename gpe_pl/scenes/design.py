@@ -18,6 +18,7 @@ from gpe_pl.scenes.scene import Point, Scene
 from gpe_pl.system.command_line import ArgumentFault, command, integer, number, truth
 
 if TYPE_CHECKING:
+    from gpe_pl.geometry.shapes import Shape
     from gpe_pl.learned.simulator import LearnedSimulator
     from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -53,7 +54,7 @@ class Design:
     """The best pose of an obstacle, and how far nodes are from the target before and after.
 
     Attributes:
-        scene: the scene with the obstacle at the best pose.
+        scene: the scene with the obstacle at the best pose. A box has become the polygon with its outline, also at the start.
         pose: shift [m] and angle [rad]; zeros if no other pose that was tried is better.
         distances: root mean square distance of nodes from the target [m] of the search's rollouts, by ``model`` and ``solver``, at the start and at the best
             pose.
@@ -138,22 +139,23 @@ def design(
         PoseError: the obstacle cannot be moved, or touches other parts of the scene within the limits.
     """
     from gpe_pl.evaluation.design.guidance import Guidance
-    from gpe_pl.evaluation.design.pose import Obstacle
+    from gpe_pl.evaluation.design.pose import Obstacle, movable
     from gpe_pl.evaluation.identification.search import SearchSettings, search
     from gpe_pl.geometry.shapes import Sphere
 
     _check(scene, target, obstacle, shift, angle, seconds, method, evaluations)
+    name, shape = scene.obstacles[obstacle - 1][0], movable(scene.obstacles[obstacle - 1][1])
+    scene = _with_obstacle(scene, name, shape)
     simulator = scene.model_for(model or scene.shipped())
     state, metadata = scene.state(simulator)
-    name, shape = scene.obstacles[obstacle - 1]
-    movable = Obstacle.of(shape, state.boundary)
+    moves = Obstacle.of(shape, state.boundary)
     limits = (shift, shift, 0.0 if isinstance(shape, Sphere) else math.radians(angle))
     if not any(limits):
         raise DesignFault(f"shift=0: {name} is a disc, which does not turn; give a shift of more than 0")
-    movable.check_limits(limits, state.boundary, state.pos, metadata.spacing, state.cells)
+    moves.check_limits(limits, state.boundary, state.pos, metadata.spacing, state.cells)
     num_frames, goal = max(1, round(seconds / metadata.frame_dt)), np.asarray(target, np.float64)
     start, solver = simulator.standing(state, metadata), _solver(scene, simulator) if solve else None
-    guidance = Guidance(simulator, start, movable, limits, goal, num_frames, failed=(4 * metadata.longest_side) ** 2)
+    guidance = Guidance(simulator, start, moves, limits, goal, num_frames, failed=(4 * metadata.longest_side) ** 2)
     before, began = guidance.misfit(np.full(len(guidance.unknowns), 0.5)), time.process_time()
     found = search(guidance, SearchSettings(method=method, num_scanned=3, max_evaluations=evaluations, profile_evaluations=0))
     if not found.misfit < math.log(guidance.failed):
@@ -162,8 +164,7 @@ def design(
         )
     spent, is_better = time.process_time() - began, found.misfit < before - LEAST_GAIN
     best, after = (tuple(guidance.pose(found.z).tolist()), found.misfit) if is_better else ((0.0, 0.0, 0.0), before)
-    changed = {name: movable.moved_shape(best)} if is_better else {}
-    moved = replace(scene, obstacles=tuple((n, changed.get(n, own)) for n, own in scene.obstacles))
+    moved = _with_obstacle(scene, name, moves.moved_shape(best)) if is_better else scene
     failed = math.log(guidance.failed)
     distances = {"model": (math.nan if before >= failed else math.exp(before / 2), math.exp(after / 2))}
     rollouts, at_best = {}, moved.state(simulator)[0]
@@ -174,6 +175,11 @@ def design(
     rollouts["model"] = predicted(simulator, at_best, metadata, num_frames, "model")
     check = "" if found.check is None or not is_better else str(found.check)
     return Design(moved, best, distances, rollouts, found.method, check, guidance.num_evaluations, guidance.num_gradients, spent)
+
+
+def _with_obstacle(scene: Scene, name: str, shape: Shape) -> Scene:
+    """Return a scene in which the obstacle of a name has another shape."""
+    return replace(scene, obstacles=tuple((n, shape if n == name else own) for n, own in scene.obstacles))
 
 
 def _solver(scene: Scene, simulator: LearnedSimulator) -> Any:

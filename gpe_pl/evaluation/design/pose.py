@@ -38,7 +38,7 @@ class Obstacle:
         nodes: mask of its nodes among all boundary nodes.
     """
 
-    shape: Sphere | Box | Polygon
+    shape: Sphere | Polygon
     centre: np.ndarray
     nodes: np.ndarray
 
@@ -47,12 +47,11 @@ class Obstacle:
         """Return the obstacle with a shape, given the sampled boundary of its scene as arrays.
 
         Raises:
-            PoseError: it is no disc, box or polygon in 2D, or touches another wall or obstacle.
+            PoseError: it is no disc or polygon in 2D (see ``movable`` for boxes), or touches another wall or obstacle.
         """
-        if boundary.pos.shape[1] != 2 or not isinstance(shape, Sphere | Box | Polygon):
-            raise PoseError(
-                f"obstacle: discs, boxes and polygons in 2D can be moved, not {type(shape).__name__} in {boundary.pos.shape[1]}D"
-            )
+        if boundary.pos.shape[1] != 2 or not isinstance(shape, Sphere | Polygon):
+            what = f"{type(shape).__name__} in {boundary.pos.shape[1]}D"
+            raise PoseError(f"obstacle: discs, polygons, and boxes as polygons can be moved in 2D, not {what}")
         others = tuple(other for other in boundary.shapes if other != shape)
         points, _ = shape.sample(shape.extent / 50)
         if others and bool((signed_distance(others, points) <= 0).any()):
@@ -61,7 +60,7 @@ class Obstacle:
         return cls(shape, _corners(shape).mean(axis=0), nodes)
 
     def moved_shape(self, pose: Sequence[float]) -> Shape:
-        """Return the shape at a pose. A box becomes a polygon."""
+        """Return the shape at a pose."""
         if isinstance(self.shape, Sphere):
             center = np.asarray(self.shape.center) + np.asarray(pose[:2])
             return replace(self.shape, center=tuple(center.tolist()))
@@ -119,19 +118,26 @@ class Obstacle:
                 sets += [(pose - step, smaller), (pose + step, smaller)]
 
 
+def movable(shape: Shape) -> Shape:
+    """Return a shape as it can be moved: a box in 2D becomes the polygon with its outline [m], all others stay.
+
+    Nodes at corners of a box have other normals than those of a polygon, and a box that is turned is a polygon. So a search that moved the nodes of the box
+    would not search among the scenes that it returns.
+    """
+    if not isinstance(shape, Box) or len(shape.low) != 2:
+        return shape
+    (left, bottom), (right, top) = shape.low, shape.high
+    return Polygon(((left, bottom), (right, bottom), (right, top), (left, top)), shape.friction, shape.restitution)
+
+
 def text(pose: Sequence[float]) -> str:
     """Return a pose for readers."""
     return f"a shift of ({pose[0]:.3g}, {pose[1]:.3g}) m and an angle of {math.degrees(pose[2]):.3g}°"
 
 
-def _corners(shape: Sphere | Box | Polygon) -> np.ndarray:
+def _corners(shape: Sphere | Polygon) -> np.ndarray:
     """Return the corners of a shape [corner, 2] in m, counter-clockwise; of a disc its centre."""
-    if isinstance(shape, Polygon):
-        return np.asarray(shape.vertices, float)
-    if isinstance(shape, Sphere):
-        return np.array([shape.center], float)
-    (left, bottom), (right, top) = shape.low, shape.high
-    return np.array([(left, bottom), (right, bottom), (right, top), (left, top)], float)
+    return np.array([shape.center] if isinstance(shape, Sphere) else shape.vertices, float)
 
 
 def _turned(vectors: Tensor, angle: Tensor) -> Tensor:

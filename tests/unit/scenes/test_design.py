@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from gpe_pl.errors import GpeError
-from gpe_pl.geometry.shapes import Polygon
+from gpe_pl.geometry.shapes import Box, Polygon
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.rollout.loop import rollout
 from gpe_pl.scenes import design as verb
 from gpe_pl.scenes.design import Design, design
 from gpe_pl.scenes.obstacles import Circle
@@ -82,6 +83,26 @@ def test_a_rollout_that_stopped_has_no_distance() -> None:
     text = Design(scene(), (0.0, 0.0, 0.0), distances, {}, "gradient", "", 1, 1, 1.0).summary()
     assert "solver: distance from the target not known, as the rollout stopped early, 0.5 m at the start" in text
     assert "keeps" not in text
+
+
+@pytest.mark.parametrize(("shift", "angle"), [(0.002, 0.0), (0.0, 20.0)])
+def test_the_distance_of_a_box_is_that_of_the_scene_that_is_returned(shift: float, angle: float) -> None:
+    """Nodes at corners of boxes have other normals than those of polygons, so both differ already at the start."""
+    seconds, goal, plate = 0.02, np.array([0.8, 0.1]), Box((0.30, 0.45), (0.34, 0.55), 0.3)
+    above = Scene(box=(1.0, 1.0)).block("sand", at=(0.28, 0.58), size=(0.06, 0.04), velocity=(0.0, -2.0)).obstacle(plate)
+    found = design(above, (0.8, 0.1), shift=shift, angle=angle, seconds=seconds, method="derivative_free", evaluations=1, solve=False)
+    simulator = LearnedSimulator.from_checkpoint("sand")
+
+    def distance(scene: Scene) -> float:
+        state, metadata = scene.state(simulator)
+        start = simulator.standing(state, metadata)
+        return verb._distance(rollout(simulator, start, round(seconds / metadata.frame_dt), metadata), goal)
+
+    assert any(found.pose)
+    (moved,) = [shape for _, shape in found.scene.obstacles]
+    start = Polygon(((0.30, 0.45), (0.34, 0.45), (0.34, 0.55), (0.30, 0.55)), 0.3)
+    scenes = [replace(found.scene, obstacles=(("obstacle 1", shape),)) for shape in (start, moved)]
+    assert found.distances["model"] == pytest.approx([*map(distance, scenes)], rel=1e-7)
 
 
 @pytest.mark.slow
