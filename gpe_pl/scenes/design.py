@@ -154,8 +154,8 @@ def design(
         raise DesignFault(f"shift=0: {name} is a disc, which does not turn; give a shift of more than 0")
     moves.check_limits(limits, state.boundary, state.pos, metadata.spacing, state.cells)
     num_frames, goal = max(1, round(seconds / metadata.frame_dt)), np.asarray(target, np.float64)
-    start, solver = simulator.standing(state, metadata), _solver(scene, simulator) if solve else None
-    guidance = Guidance(simulator, start, moves, limits, goal, num_frames, failed=(4 * metadata.longest_side) ** 2)
+    solver = _solver(scene, simulator) if solve else None
+    guidance = Guidance(simulator, state.to_torch(), metadata, moves, limits, goal, num_frames, failed=(4 * metadata.longest_side) ** 2)
     before, began = guidance.misfit(np.full(len(guidance.unknowns), 0.5)), time.process_time()
     found = search(guidance, SearchSettings(method=method, num_scanned=3, max_evaluations=evaluations, profile_evaluations=0))
     if not found.misfit < math.log(guidance.failed):

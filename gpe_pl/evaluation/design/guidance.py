@@ -18,6 +18,7 @@ from gpe_pl.evaluation.design.pose import NAMES, Obstacle
 from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata
 
 
 @dataclass
@@ -26,7 +27,8 @@ class Guidance:
 
     Attributes:
         simulator: the model.
-        state: the scene at the start, as tensors.
+        state: the scene at the start, as tensors, with velocities at that instant.
+        metadata: metadata of the scene.
         obstacle: the obstacle that is moved.
         limits: largest shifts [m] and angle [rad], of both signs; 0 keeps a part of the pose.
         target: point that the nodes should reach [2] in m.
@@ -37,6 +39,7 @@ class Guidance:
 
     simulator: LearnedSimulator
     state: State
+    metadata: Metadata
     obstacle: Obstacle
     limits: tuple[float, float, float]
     target: np.ndarray
@@ -77,7 +80,8 @@ class Guidance:
         def last(_: int, frame: int, state: State) -> Tensor | None:
             return squared_distance(state.pos, torch.from_numpy(self.target)) if frame == self.num_frames else None
 
-        start = self.obstacle.moved(self.state, self._pose(z))
+        moved = self.obstacle.moved(self.state, self._pose(z))
+        start = self.simulator.standing(moved, self.metadata)  # velocities before the start depend on what is near the obstacle
         square = rollout_scores(self.simulator, {0: start}, self.num_frames, last).get((0, self.num_frames))
         if square is None or not bool(square < self.failed):
             return torch.tensor(math.log(self.failed), dtype=torch.float64)
