@@ -329,13 +329,13 @@ class LearnedSimulator(nn.Module):
             version = f"version {scene.solver_version} of the solver {scene.solver}, in training version {own.solver_version}"
             self._warn_once("solver", f"the ground truth is from {version}, whose trajectories differ")
         state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
-        return self._checked(state, f"frame {frame}")
+        return self._checked(state, scene, f"frame {frame}")
 
     def standing(self, state: State, scene: Metadata) -> State:
         """Return an initial state for a scene without earlier frames, on this model's device (``mean_velocities``). Errors: those of ``initial_state``."""
         self._check_own(scene)
         state = replace(state.to_torch(self.acceleration_std.device), velocity_history=None, frame_velocity=None)
-        history = history_at_start(self._checked(state, "start"), self.builder)
+        history = history_at_start(self._checked(state, scene, "start"), self.builder)
         return replace(state, vel=history[:, -1], velocity_history=history)
 
     def fits(self, scene: Metadata) -> bool:
@@ -386,8 +386,8 @@ class LearnedSimulator(nn.Module):
         stride = round(self.builder.metadata.frame_dt / stored.frame_dt)
         return stride if stride >= 1 and self.fits(stored.every(stride)) else 0
 
-    def _checked(self, state: State, where: str) -> State:
-        check_start(state, self.builder.metadata, where)
+    def _checked(self, state: State, scene: Metadata, where: str) -> State:
+        check_start(state, scene, where)
         clamped = "; clamped to the nearest trained value" if self.clamps_parameters else ""
         found = [(kind, line + clamped) for kind, line in self._outside_parameters(state)]
         for kind, line in (*found, *self._outside_scene(state), *inside_obstacles(state, self.builder.metadata.spacing)):

@@ -9,7 +9,8 @@ import torch
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.graphs.features import history_of
-from gpe_pl.schema import node_code
+from gpe_pl.rollout.guard import unsound
+from gpe_pl.schema import LARGEST, node_code
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata
 
@@ -22,34 +23,37 @@ class SceneError(GpeError, ValueError):
 
 
 def check_start(state: State, metadata: Metadata, where: str) -> None:
-    """Check that positions, velocities, masses and material parameters can be rolled out.
+    """Check that a rollout can start from a state (``guard.unsound``). Positions, velocities, masses and material parameters have messages of their own.
 
     Args:
         state: state of the scene, as tensors.
-        metadata: metadata of the training data.
+        metadata: metadata of the scene.
         where: frame of the state, for messages.
 
     Raises:
-        SceneError: a value is not finite or breaks its rule; the message names the node.
+        SceneError: a value is not finite or breaks its rule, and the message names the node; or an array or shape of the scene is wrong.
     """
     at_frame = state.vel if state.frame_velocity is None else state.frame_velocity
     for name, values in (("pos", state.pos), ("velocity", history_of(state)), ("velocity at the frame", at_frame)):
-        bad = ~torch.isfinite(values).flatten(1).all(dim=1)
+        bad = ~(values.abs() <= LARGEST).flatten(1).all(dim=1)  # also finds NaN
         if bad.any():
             raise SceneError(
-                f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite; correct it, or start at another frame"
+                f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite or too large; correct it, or start at another frame"
             )
     bad = ~(torch.isfinite(state.mass) & (state.mass > 0))
     if bad.any():
         node = int(bad.nonzero()[0])
         raise SceneError(f"node {node} has a mass of {float(state.mass[node]):g} kg; give every node a positive and finite mass")
+    wrong = unsound(state, metadata)
+    if wrong is not None and wrong.reason != "material":
+        raise SceneError(f"{where}: {wrong.message}")
     for material in metadata.materials:
         rows = torch.nonzero(state.node_type == node_code(material)).flatten()
         for spec, number in zip(metadata.parameters_of(material), metadata.columns_of(material), strict=True):
             column = state.material_params[rows, number]
-            wrong = ~spec.accepts(column)
-            if wrong.any():
-                node, value = int(rows[wrong][0]), float(column[wrong][0])
+            bad = ~spec.accepts(column)
+            if bad.any():
+                node, value = int(rows[bad][0]), float(column[bad][0])
                 raise SceneError(f"node {node} ({material}): {spec.name} is {spec.quantity(value)}, must be {spec.rule}")
 
 

@@ -15,7 +15,7 @@ from gpe_pl.geometry.compiled_distance import has_compiled_distance
 from gpe_pl.geometry.compiled_surfaces import are_near
 from gpe_pl.geometry.shape_values import shapes_fault
 from gpe_pl.geometry.shapes import Shape, signed_distance
-from gpe_pl.schema import NODE_TYPES
+from gpe_pl.schema import LARGEST, NODE_TYPES
 from gpe_pl.trajectory.boundary import as_numpy
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Termination
@@ -290,8 +290,8 @@ def crowding(pos: np.ndarray, width: float) -> np.ndarray:
 def unsound(state: State, metadata: Metadata) -> Termination | None:
     """Return the reason why a rollout cannot start: the first array or shape of the initial state that breaks its rule. Return None if there is none.
 
-    The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``. Gravity, velocity history and velocities at the frame must have their shapes and
-    be finite.
+    The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``. Gravity, velocity history and velocities at the frame must have their shapes, be
+    finite and be at most ``schema.LARGEST``.
     """
     b, has_mesh = state.boundary, state.cells is not None and state.rest_pos is not None
     nodes = {
@@ -321,8 +321,8 @@ def unsound(state: State, metadata: Metadata) -> Termination | None:
         if values.ndim != len(shape) or any(size not in (-1, found) for size, found in zip(shape, values.shape, strict=True)):
             wanted = ", ".join("any" if size == -1 else str(size) for size in shape)
             return Termination("input", 0, -1, f"{name} has the shape {tuple(values.shape)}, must be ({wanted})")
-        if not np.isfinite(as_numpy(values)).all():
-            return Termination("nan", 0, -1, f"{name} is not finite")
+        if not (np.abs(as_numpy(values)) <= LARGEST).all():  # also finds NaN
+            return Termination("nan", 0, -1, f"{name} is not finite or too large")
     if (wrong := shapes_fault(b.shapes, metadata.periodicity)) is not None:
         return Termination("input", 0, -1, wrong)
     return None

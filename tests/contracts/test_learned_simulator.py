@@ -201,9 +201,19 @@ def test_targets_that_teach_nothing_are_refused(value: float) -> None:
             r"node 4 \(sand\): friction_angle is nan deg, must be finite",
         ),
         (lambda t: replace(t, mass=_with(t.mass, (6,), 0.0)), "node 6 has a mass of 0 kg; give every node a positive and finite mass"),
+        (
+            lambda t: replace(t, vel=_with(t.vel, (3, 5, 0), 1e30)),
+            "frame 3: node 5 has a velocity at the frame that is not finite or too large",
+        ),
+        (
+            lambda t: replace(t, boundary=replace(t.boundary, pos=_with(t.boundary.pos, (2, 1), np.nan))),
+            "frame 3: field 'boundary_pos': .*node 2",
+        ),
+        (lambda t: replace(t, mass=t.mass[:-1]), "frame 3: field 'mass' has size 11 along 'node', expected 12"),
+        (lambda t: replace(t, node_type=t.node_type[:-1]), "frame 3: field 'mass' has size 12 along 'node', expected 11"),
     ],
 )
-def test_an_initial_state_that_is_not_finite_names_the_node(
+def test_an_initial_state_that_cannot_be_rolled_out_names_the_place(
     trajectory: Trajectory, change: Callable[[Trajectory], Trajectory], message: str
 ) -> None:
     simulator = learned(builder_of(trajectory))

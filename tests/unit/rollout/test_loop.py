@@ -209,8 +209,10 @@ def test_a_velocity_at_the_frame_that_is_not_finite_stops_a_rollout(trajectory: 
     at_frame[2, 1] = np.inf
     stop = Guard().check(replace(state, frame_velocity=at_frame), 4)
     assert stop is not None and (stop.reason, stop.frame, stop.node) == ("nan", 4, 2)
-    result = rollout(FreeFall(0.01), replace(state, frame_velocity=at_frame), 3, trajectory.metadata)
-    assert result.termination is not None and result.termination.message == "frame_velocity is not finite"
+    for value in (np.inf, 1e30):
+        at_frame[2, 1] = value
+        result = rollout(FreeFall(0.01), replace(state, frame_velocity=at_frame), 3, trajectory.metadata)
+        assert result.termination is not None and result.termination.message == "frame_velocity is not finite or too large"
     assert Guard().check(replace(state, frame_velocity=state.vel), 4) is None
 
 
