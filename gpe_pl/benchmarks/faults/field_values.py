@@ -7,6 +7,7 @@ The functions of these five ways have the same arguments. They take the first tr
 from __future__ import annotations
 
 import logging
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -29,7 +30,6 @@ from gpe_pl.errors import GpeError
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, Values, node_code
 from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
-from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import digest, read_trajectory, stored_arrays, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -52,14 +52,18 @@ LONGER = "a row more"
 FIRST = "00000"
 
 
-def spoilt(arrays: dict[str, np.ndarray], key: str, value: Value, seed: int) -> dict[str, np.ndarray]:
-    """Return the arrays with a wrong value at a random position in one of them, or with one row more than the others."""
+def spoilt(arrays: dict[str, np.ndarray], key: str, value: Value, seed: int, first_frame: int = 0) -> dict[str, np.ndarray]:
+    """Return the arrays with a wrong value at a random position in one of them, or with one row more than the others.
+
+    In an array with an axis of frames, the position is at ``first_frame`` or later.
+    """
     array = arrays[key].copy()
     if value == LONGER:
         axis = int(FIELDS[key].dims[0] in ("frame", MOTION))  # the axis of nodes or cells
         array = np.concatenate([array, array.take([0], axis)], axis)
     else:
-        array[np.unravel_index(int(np.random.default_rng(seed).integers(array.size)), array.shape)] = value
+        part = array[first_frame:] if FIELDS[key].dims[0] == "frame" else array
+        part[np.unravel_index(int(np.random.default_rng(seed).integers(part.size)), part.shape)] = value
     return {**arrays, key: array}
 
 
@@ -92,11 +96,15 @@ def convert(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str
 
 
 def roll_out(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """Start a learned simulator from the changed trajectory, and return the reason why it stops."""
+    """Start a learned simulator from the last frame of the changed trajectory, and return the reason why it stops.
+
+    The wrong value is in a frame that enters the state.
+    """
     sound, arrays = _sound(shard)
-    trajectory = _trajectory(sound, spoilt(arrays, key, value, seed))
-    simulator = small_model(sound.metadata)
-    result = rollout(simulator, _last_state(trajectory), 2, sound.metadata)
+    simulator, last = small_model(sound.metadata), sound.num_frames - 1
+    first = last if key == "vel" else last - simulator.builder.config.history
+    state = simulator.initial_state(_trajectory(sound, spoilt(arrays, key, value, seed, first)), last)
+    result = rollout(simulator, state, 2, sound.metadata)
     return "" if result.termination is None else f"{result.termination.reason}: {result.termination.message}"
 
 
@@ -108,7 +116,7 @@ WAYS: dict[str, Callable[[Path, str, float | str, int, Path], str]] = {
     "rollout": roll_out,
 }
 OF_STATES = ("node_type", "mass", "material_params", "boundary_", "rest_pos", "cells")
-"""Prefixes of the fields from which a rollout starts, besides positions, which it takes from several frames."""
+"""Prefixes of the fields from which a rollout starts, besides positions, which it takes from several frames, and velocities."""
 
 
 def brought_in(way: str, shard: Path, key: str, value: Value, seed: int, folder: Path) -> Verdict:
@@ -121,18 +129,21 @@ def brought_in(way: str, shard: Path, key: str, value: Value, seed: int, folder:
         return Verdict("traceback", f"{type(error).__name__}: {error}")
     if not text:
         return Verdict("accepted", "no error, and nothing was left out")
-    is_named = any(name in text for name in _names(shard, key, value))
+    is_named = any(re.search(rf"\b{name}\b", text) for name in _names(shard, key, value))  # pos is no part of positions or rest_pos
     return Verdict("refused", text[:MAX_DETAIL]) if is_named else Verdict("accepted", f"does not name the field: {text}"[:MAX_DETAIL])
 
 
 def _names(shard: Path, key: str, value: Value) -> tuple[str, ...]:
     """Return the names that a message may give to the wrong field.
 
-    Messages name the column of a material parameter, and may name the velocity instead of the position. Messages about a wrong length contain ``has size``.
+    Messages name the column of a material parameter, and may name the velocity instead of the position. Messages about a wrong length contain ``has size`` or
+    ``has the shape``.
     """
     if value == LONGER:
-        return ("has size",)
-    return {"material_params": read_trajectory(shard, FIRST).metadata.param_names, "pos": ("pos", "vel")}.get(key, (key,))
+        return ("has size", "has the shape")
+    velocities = ("vel", "velocity", "frame_velocity")
+    others = {"material_params": read_trajectory(shard, FIRST).metadata.param_names, "pos": ("pos", *velocities), "vel": velocities}
+    return others.get(key, (key,))
 
 
 # --- how ------------------------------------------------------------------------------------------------------------------------------------
@@ -197,18 +208,13 @@ def _trajectory(sound: Trajectory, arrays: dict[str, np.ndarray]) -> Trajectory:
     return replace(sound, **values, boundary=boundary)
 
 
-def _last_state(trajectory: Trajectory) -> State:
-    """Return the last frame as a state with velocity history."""
-    return trajectory.state(trajectory.num_frames - 1, history=2)
-
-
 def _applies(way: str, key: str) -> bool:
     """Tell whether a field enters in one of the ways.
 
-    A rollout does not take stored velocities. Neither a rollout nor an import takes stresses and the dimension of cells.
+    Neither a rollout nor an import takes stresses and the dimension of cells.
     """
     if way == "rollout":
-        return key.startswith(OF_STATES) or key == "pos"
+        return key.startswith(OF_STATES) or key in ("pos", "vel")
     return way != "conversion" or not ("stress" in key or "mises" in key or key == "cell_dim")
 
 

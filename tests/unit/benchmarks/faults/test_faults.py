@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -25,7 +26,11 @@ from gpe_pl.benchmarks.faults.verdict import GOOD, Fault, Verdict, verdict_of
 from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.errors import GpeError
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.system import early_interrupts
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.store import read_trajectory, stored_arrays, write_shard
+from tests.conftest import make_trajectory
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +112,55 @@ def test_small_files_and_archives(tmp_path: Path, step: int) -> None:
 
 
 # --- and it is seen when it is not ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def drifting(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file with two trajectories that move steadily, which nothing refuses."""
+    path = tmp_path_factory.mktemp("drifting") / "shard-00000.h5"
+    way = 1e-3 * np.arange(6, dtype=np.float32)[:, None, None]
+    write_shard(path, [replace(t, pos=t.pos[:1] + way, vel=np.full_like(t.vel, 0.1)) for t in map(make_trajectory, (0, 1))])
+    return path
+
+
+@pytest.mark.parametrize("way", field_values.WAYS)
+@pytest.mark.parametrize("key", ["pos", "mass"])
+def test_a_sound_trajectory_is_accepted(drifting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str, key: str) -> None:
+    monkeypatch.setattr(field_values, "spoilt", lambda arrays, *_: dict(arrays))
+    verdict = field_values.brought_in(way, drifting, key, float("nan"), 0, tmp_path)
+    assert verdict == Verdict("accepted", "no error, and nothing was left out")
+
+
+def test_every_wrong_value_of_a_rollout_reaches_its_state(shard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arrays = stored_arrays(read_trajectory(shard, "00000"))
+    states: list[State] = []
+    monkeypatch.setattr(LearnedSimulator, "_checked", lambda _, state, *__: states.append(state) or state)
+    monkeypatch.setattr(field_values, "rollout", lambda *_: SimpleNamespace(termination=None))
+    faults = [fault for seed in range(5) for fault in field_values.faults({"sand": shard}, 100 * seed) if fault.kind == "value, rollout"]
+    assert {fault.name.split()[1] for fault in faults} == {f"{key}:" for key in arrays}
+    for fault in faults:
+        assert fault.attack(tmp_path).status == "accepted"
+    monkeypatch.setattr(field_values, "spoilt", lambda sound, *_: dict(sound))
+    faults[0].attack(tmp_path)
+    *wrong, sound = map(_values, states)
+    missed = [fault.name for fault, values in zip(faults, wrong, strict=True) if values == sound]
+    assert not missed
+
+
+def _values(state: State) -> list[bytes]:
+    """Return the arrays of a state from which a rollout starts, as bytes."""
+    b = state.boundary
+    walls = (b.pos, b.vel, b.normal, b.friction, b.restitution)
+    nodes = (state.pos, state.velocity_history, state.frame_velocity, state.node_type, state.mass, state.material_params)
+    return [np.asarray(values).tobytes() for values in (*walls, *nodes)]
+
+
+@pytest.mark.parametrize("text", ["positions are float64", "field 'rest_pos': not finite", "position"])
+def test_a_part_of_a_word_names_no_field(shard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    monkeypatch.setitem(field_values.WAYS, "rollout", lambda *_: text)
+    assert field_values.brought_in("rollout", shard, "pos", 0.0, 0, tmp_path).status == "accepted"
+    monkeypatch.setitem(field_values.WAYS, "rollout", lambda *_: "field 'pos': not finite")
+    assert field_values.brought_in("rollout", shard, "pos", 0.0, 0, tmp_path).status == "refused"
 
 
 @pytest.mark.slow
