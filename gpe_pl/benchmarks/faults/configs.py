@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import numpy as np
 import yaml
 
 from gpe_pl.benchmarks.faults.isolation import run
+from gpe_pl.benchmarks.faults.runs import Command
 from gpe_pl.benchmarks.faults.verdict import Fault, Verdict
 from gpe_pl.errors import GpeError
 
@@ -66,41 +69,43 @@ def mutations(key: str, value: Any) -> Iterator[tuple[str, str, bool]]:
         yield "absurd value", f"{key}={text}", False
 
 
-def started(command: str, arguments: Sequence[str], override: str, must_fail: bool, limit: float, folder: Path) -> Verdict:
+def started(command: Command, override: str, must_fail: bool, limit: float, folder: Path) -> Verdict:
     """Start a command with one additional override, and return the verdict.
 
+    A command that makes data starts in an empty folder, because it refuses every other setting where data exist. One that reads data has a copy of them.
+
     Args:
-        command: name of the command.
-        arguments: its other arguments.
+        command: the undisturbed command.
         override: the additional override.
         must_fail: whether the command has to refuse it.
         limit: time [s] after which the command is stopped.
-        folder: folder of its results.
+        folder: empty folder of its data and results.
     """
-    ended = run(command, [*arguments, f"paths.runs={folder}", override], limit)
+    if command.data is not None:
+        shutil.copytree(command.data, folder / "data")
+        command = replace(command, data=None)
+    ended = run(command.module, [*command.given(folder), override], limit)
     verdict = ended.verdict("accepted" if must_fail else "harmless")
     if verdict.status in ("refused", "harmless") and list(folder.rglob("*.part*")):
         return Verdict("half-written", verdict.detail)
     return verdict
 
 
-def faults(command: str, arguments: Sequence[str], count: int, seed: int = 0, limit: float = 120.0, seconds: float = 0.0) -> list[Fault]:
+def faults(command: Command, count: int, seed: int = 0, limit: float = 120.0) -> list[Fault]:
     """Return mutations of the configuration of a command.
 
     Args:
-        command: name of the command, such as ``fit``.
-        arguments: arguments of the undisturbed command.
+        command: the undisturbed command; some mutations change nothing, and it then runs to its end.
         count: number of mutations, divided equally among the kinds.
         seed: seed of their choice.
         limit: time [s] after which a command is stopped.
-        seconds: duration of the undisturbed command [s]; some mutations change nothing, and the command then runs to its end.
 
     Raises:
         NoConfigError: the undisturbed arguments are refused.
     """
-    shown = run(command, [*arguments, "--cfg", "job", "--resolve"])
+    shown = run(command.module, [*command.arguments, "--cfg", "job", "--resolve"])
     if shown.code != 0:
-        raise NoConfigError(f"{command} {' '.join(arguments)}: {shown.output}")
+        raise NoConfigError(f"{command.module} {' '.join(command.arguments)}: {shown.output}")
     rng = np.random.default_rng(seed)
     by_kind: dict[str, list[tuple[str, bool]]] = {}
     for key, value in leaves(yaml.safe_load(shown.output)):
@@ -110,6 +115,6 @@ def faults(command: str, arguments: Sequence[str], count: int, seed: int = 0, li
     for kind, every in by_kind.items():
         chosen = rng.permutation(len(every))[: math.ceil(count / len(by_kind))]
         for override, must_fail in (every[k] for k in sorted(chosen)):
-            attack = partial(started, command, tuple(arguments), override, must_fail, limit)
-            found.append(Fault(f"configuration, {kind}", f"{command} {override}", attack, seconds))
+            attack = partial(started, command, override, must_fail, limit)
+            found.append(Fault(f"configuration, {kind}", f"{command.module} {override}", attack, command.seconds))
     return found

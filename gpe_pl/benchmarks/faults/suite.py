@@ -185,9 +185,8 @@ def _faults(settings: Settings, specs: dict[str, DatasetSpec], commands: dict[st
         found += checkpoints.faults(saved[0], settings.num_file_damages, settings.seed)
     for name, command in commands.items():
         attacked, sound = settings.commands[name], root / name
-        given = [*command.arguments, f"paths.data={command.data or sound / 'data'}"]
         if attacked.num_configs:
-            found += configs.faults(command.module, given, attacked.num_configs, settings.seed, settings.limit, command.seconds)
+            found += configs.faults(command, attacked.num_configs, settings.seed, settings.limit)
         found += runs.damage_faults(command, sound, attacked.num_damages, settings.seed, settings.limit)
         found += side_files.command_faults(command, sound, attacked.num_contents, settings.seed, settings.limit)
         found += outside.faults(command, sound, attacked.names, attacked.leads_out, settings.limit)

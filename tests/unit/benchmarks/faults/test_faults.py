@@ -233,6 +233,22 @@ def test_every_kind_of_wrong_configuration_is_made_of_a_value() -> None:
     assert ("wrong type", "a.b=banana", True) in list(configs.mutations("a.b", 1))
 
 
+def test_a_wrong_configuration_has_data_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where data exist with other settings, a command refuses any setting, and the data belong to other faults, too."""
+    data, own = tmp_path / "data", tmp_path / "own"
+    data.mkdir()
+    (data / "dataset.json").touch()
+    given: list[list[str]] = []
+    monkeypatch.setattr(configs, "run", lambda _, arguments, *__: given.append(arguments) or Ended(0, "seed: 0\n"))
+    for command, found in ((runs.Command("one", "simulate", ()), []), (runs.Command("other", "fit", (), str(data)), ["dataset.json"])):
+        fault = configs.faults(command, 1)[0]
+        shutil.rmtree(own, ignore_errors=True)
+        own.mkdir()
+        fault.attack(own)
+        assert {f"paths.data={own / 'data'}", f"paths.runs={own / 'runs'}"} <= set(given[-1])
+        assert [path.name for path in own.glob("data/*")] == found
+
+
 def _finds(_: Path) -> Verdict:
     return Verdict("refused", "found")
 
