@@ -58,9 +58,12 @@ def test_two_trainings_at_once(data: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("state", outside.STATES)
 def test_paths_in_checkpoints_lead_nowhere(data: Path, tmp_path: Path, state: str) -> None:
-    attack = partial(outside.resumed, command("fit", data), state, "{canary}/checkpoints/best.ckpt", 600.0)
+    fit = command("fit", data)
+    assert isolation.run("fit", fit.given(tmp_path / "whole")).code == 0
+    attack = partial(outside.resumed, fit, state, "{canary}/checkpoints/best.ckpt", runs.digests(tmp_path / "whole"), 600.0)
     verdict = isolation._watched(Fault("kind", state, attack, 600.0), tmp_path / "own", tmp_path / isolation.CANARY)
     assert verdict.status in GOOD, verdict
+    assert "not done" not in verdict.detail
 
 
 @pytest.mark.parametrize("size", [100, 20_000])

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from gpe_pl.benchmarks.faults import isolation
+from gpe_pl.benchmarks.faults import isolation, runs
 from gpe_pl.benchmarks.faults.isolation import CANARY
 from gpe_pl.benchmarks.faults.runs import Command
 from gpe_pl.benchmarks.faults.verdict import Fault, Verdict
@@ -65,13 +65,17 @@ STATES: dict[str, Callable[[str], dict[str, Any]]] = {
         "kth_value": torch.tensor(1e9),
         "best_k_models": {path: torch.tensor(1e9)},
     },
-    "own": lambda path: {"best": path, "last": path, "best_step": 0, "lowest": [1e9]},
+    "own": lambda path: {"best": path, "last": path},
+    "in place of numbers": lambda path: {"best_step": path, "lowest": [path]},
 }
-"""States of callbacks in a checkpoint that name a path."""
+"""States of callbacks in a checkpoint that name a path. A training stores no path; only the last state replaces entries that it reads."""
 
 
-def resumed(command: Command, state: str, path: str, limit: float, folder: Path) -> Verdict:
-    """Interrupt a training, put a path that leads outside into the states of callbacks in its checkpoint (see ``STATES``), and repeat the command."""
+def resumed(command: Command, state: str, path: str, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
+    """Interrupt a training, put a path that leads outside into the states of callbacks in its checkpoint (see ``STATES``), and repeat the command.
+
+    It must refuse the checkpoint or end with the results whose digests are ``expected``.
+    """
     own = folder / "own"
     own.mkdir()
     last = interrupted(command, limit, own)
@@ -82,7 +86,8 @@ def resumed(command: Command, state: str, path: str, limit: float, folder: Path)
     names = [*stored["callbacks"], "ModelCheckpoint", "Checkpoints"]
     stored["callbacks"] = {name: {**(stored["callbacks"].get(name) or {}), **evil} for name in names}
     torch.save(stored, last)
-    return isolation.run(command.module, command.given(own), limit).verdict()
+    verdict = isolation.run(command.module, command.given(own), limit).verdict()
+    return runs.compared(own, expected, verdict.detail) if verdict.status == "harmless" else verdict
 
 
 def faults(command: Command, sound: Path, keys: Sequence[str], also_files: bool, limit: float) -> list[Fault]:
@@ -101,12 +106,13 @@ def faults(command: Command, sound: Path, keys: Sequence[str], also_files: bool,
         attack = partial(linked, command, sound, part, target, limit)
         found.append(Fault("link that leads out", f"{command.name}: {part}", attack, command.seconds))
     if any(sound.rglob("last.ckpt")):
+        expected = runs.digests(sound)
         for state in STATES:
             for path in (
                 "{canary}/checkpoints/best.ckpt",
                 "file://{canary}/checkpoints/best.ckpt",
                 "../../../../../canary/checkpoints/best.ckpt",
             ):
-                attack = partial(resumed, command, state, path, limit)
+                attack = partial(resumed, command, state, path, expected, limit)
                 found.append(Fault("checkpoint that leads out", f"{command.name}: {state}, {path}", attack, 2 * command.seconds))
     return found

@@ -169,12 +169,17 @@ def finished(command: Command, folder: Path, expected: dict[str, str], limit: fl
     may_be_done = command.module in ONCE and verdict.status == "refused"
     if ended.code != 0 and not may_be_done:
         return Verdict("different", f"does not resume: {verdict.status}: {verdict.detail}")
+    return compared(folder, expected, verdict.detail, stays)
+
+
+def compared(folder: Path, expected: dict[str, str], detail: str, stays: frozenset[str] = frozenset()) -> Verdict:
+    """Compare what a command has left in a folder with ``expected``, as ``finished`` does. ``detail`` are the last words of the command."""
     if broken := incomplete(folder):
         return Verdict("half-written", "; ".join(broken))
     found = digests(folder)
     wrong = sorted(name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name))
     if wrong:
-        return Verdict("different", f"{', '.join(wrong)}; {verdict.detail}")
+        return Verdict("different", f"{', '.join(wrong)}; {detail}")
     left = [name for name in leftovers(folder) if name not in stays]
     return Verdict("half-written", f"left behind: {', '.join(left)}") if left else Verdict("harmless", "equal bit for bit")
 

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl.benchmarks.faults import checkpoints, configs, field_values, isolation, pairs, runs, scenes, side_files, stores, suite
+from gpe_pl.benchmarks.faults import checkpoints, configs, field_values, isolation, outside, pairs, runs, scenes, side_files, stores, suite
 from gpe_pl.benchmarks.faults.isolation import CANARY, Ended, verdicts
 from gpe_pl.benchmarks.faults.suite import report
 from gpe_pl.benchmarks.faults.verdict import GOOD, Fault, Verdict, verdict_of
@@ -396,6 +396,23 @@ def test_an_import_that_is_done_need_not_be_done_again(
     monkeypatch.setattr(isolation, "run", lambda *_: Ended(2, said))
     monkeypatch.setattr(runs, "digests", lambda _: {"a": found})
     assert runs.finished(runs.Command("one", module, ()), tmp_path, {"a": "1"}, 1.0).status == status
+
+
+@pytest.mark.parametrize(("found", "status"), [("1", "harmless"), ("2", "different")])
+@pytest.mark.parametrize("state", outside.STATES)
+def test_a_path_in_a_checkpoint_must_not_change_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str, found: str, status: str
+) -> None:
+    last, before = tmp_path / "last.ckpt", {"best_step": 2, "lowest": [0.5]}
+    torch.save({"callbacks": {"Checkpoints": before}}, last)
+    monkeypatch.setattr(outside, "interrupted", lambda *_: last)
+    monkeypatch.setattr(isolation, "run", lambda *_: Ended(0, ""))
+    monkeypatch.setattr(runs, "digests", lambda _: {"a": found})
+    verdict = outside.resumed(runs.Command("one", "fit", ()), state, "{canary}/best.ckpt", {"a": "1"}, 1.0, tmp_path)
+    assert verdict.status == status
+    after = torch.load(last, weights_only=True)["callbacks"]["Checkpoints"]
+    assert CANARY in str(after)
+    assert all(after[key] == before[key] or CANARY in str(after[key]) for key in before)  # another number would change results, too
 
 
 def test_details_do_not_say_where_the_package_lies() -> None:
