@@ -57,6 +57,10 @@ MESSAGE_BYTES = 1000
 """Smallest file size that leaves room for a command's output, which goes to a file too; with less room its error would be cut off."""
 
 
+class DiskSizeError(GpeError):
+    """Raised for the size of a disk that would not fill up."""
+
+
 @dataclass(frozen=True)
 class Command:
     """A command, and the folders of its data and results.
@@ -326,8 +330,7 @@ def full_disk(command: Command, size: int, expected: dict[str, str], limit: floa
     with small_disk(folder / "disk", size) as is_mounted:
         own = folder / "disk"
         prepare = None if is_mounted else partial(limit_file_size, size)
-        ended = isolation.run(command.module, command.given(own), limit, prepare)
-        verdict = ended.verdict()
+        verdict = isolation.run(command.module, command.given(own), limit, prepare).verdict("accepted")
         if verdict.status != "refused":
             return verdict
         if broken := incomplete(own):
@@ -341,7 +344,7 @@ def full_disk(command: Command, size: int, expected: dict[str, str], limit: floa
 
 def file_limit(command: Command, size: int, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
     """Run a command while no file may exceed ``size`` bytes; then run it again without this limit, as in ``full_disk``."""
-    verdict = isolation.run(command.module, command.given(folder), limit, partial(limit_file_size, size)).verdict()
+    verdict = isolation.run(command.module, command.given(folder), limit, partial(limit_file_size, size)).verdict("accepted")
     if verdict.status != "refused":
         return verdict
     if broken := incomplete(folder):
@@ -372,10 +375,17 @@ def file_in_the_way(command: Command, limit: float, folder: Path) -> Verdict:
     return isolation.run(command.module, command.given(folder), limit).verdict("accepted")
 
 
-def disk_faults(command: Command, sizes: Sequence[int], expected: dict[str, str], limit: float) -> list[Fault]:
-    """Return faults of full disks, of limited file sizes [bytes], and of folders that are not writable."""
+def disk_faults(command: Command, sizes: Sequence[int], sound: Path, expected: dict[str, str], limit: float) -> list[Fault]:
+    """Return faults of full disks, of limited file sizes [bytes], and of folders that are not writable.
+
+    Raises:
+        DiskSizeError: a size has room for the largest file of the undisturbed run.
+    """
+    largest = max(path.stat().st_size for path in sound.rglob("*") if path.is_file())
     found = []
     for size in sizes:
+        if size >= largest:
+            raise DiskSizeError(f"disk_sizes of {command.name}: {size} bytes have room for its largest file, of {largest} bytes; give less")
         found.append(
             Fault("disk full", f"{command.name}, {size} bytes", partial(full_disk, command, size, expected, limit), 2 * command.seconds)
         )

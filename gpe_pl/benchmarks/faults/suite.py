@@ -61,7 +61,7 @@ class Attacked:
         num_contents: number of changes to its small files, each followed by the same command.
         names: keys whose values become names of folders.
         leads_out: also try links, and paths in checkpoints, that lead out of its folder.
-        disk_sizes: sizes of disks that fill up [bytes].
+        disk_sizes: sizes of disks that fill up [bytes], less than the largest file that the command writes.
     """
 
     module: Annotated[str, Field(pattern="^(simulate|fit|evaluate|convert|benchmark)$")]
@@ -109,6 +109,8 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     Raises:
         PreparationError: an undisturbed command fails.
         IsolationError: the system cannot fork processes.
+        NoConfigError: an undisturbed command does not print its configuration.
+        DiskSizeError: a disk would not fill up.
     """
     records: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
@@ -198,7 +200,7 @@ def _faults(settings: Settings, specs: dict[str, DatasetSpec], commands: dict[st
         for part in DELETED[attacked.module] if attacked.num_deletions else ():
             found += pairs.deletion_faults(command, part, expected[part], attacked.num_deletions, settings.seed, settings.limit)
         if attacked.disk_sizes is not None:
-            found += runs.disk_faults(command, attacked.disk_sizes, left, settings.limit)
+            found += runs.disk_faults(command, attacked.disk_sizes, sound, left, settings.limit)
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import runpy
@@ -413,6 +414,26 @@ def test_a_path_in_a_checkpoint_must_not_change_results(
     after = torch.load(last, weights_only=True)["callbacks"]["Checkpoints"]
     assert CANARY in str(after)
     assert all(after[key] == before[key] or CANARY in str(after[key]) for key in before)  # another number would change results, too
+
+
+@pytest.mark.parametrize("attack", [runs.full_disk, runs.file_limit])
+def test_a_command_that_succeeds_on_a_full_disk_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, attack: Callable[..., Verdict]
+) -> None:
+    monkeypatch.setattr(runs, "small_disk", lambda *_: contextlib.nullcontext(False))
+    monkeypatch.setattr(isolation, "run", lambda *_: Ended(0, ""))
+    assert attack(runs.Command("one", "fit", ()), 1000, {}, 1.0, tmp_path).status == "accepted"
+
+
+def test_a_disk_that_would_not_fill_up_is_no_fault(tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    for name, size in (("best.ckpt", 3000), ("metrics.csv", 2000)):
+        (tmp_path / "runs" / name).write_bytes(bytes(size))
+    command = runs.Command("one", "fit", ())
+    found = runs.disk_faults(command, [100, 2999], tmp_path, {}, 1.0)
+    assert [fault.kind for fault in found] == ["disk full", "disk full", "file too large", "folder not writable", "folder not writable"]
+    with pytest.raises(GpeError, match="disk_sizes of one: 3000 bytes have room for its largest file, of 3000 bytes"):
+        runs.disk_faults(command, [100, 3000], tmp_path, {}, 1.0)
 
 
 def test_details_do_not_say_where_the_package_lies() -> None:
