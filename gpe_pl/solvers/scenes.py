@@ -297,6 +297,8 @@ class BodyScene(OnGrid):
         lacking = [m for m in self.materials if m not in self.density]
         if lacking:
             raise ValueError(f"density of {', '.join(lacking)} is missing")
+        if strange := [m for m in self.density if m not in MATERIALS]:
+            raise ValueError(f"density of {', '.join(strange)}: no material; materials are {', '.join(MATERIALS)}")
         check_ranges(self, "obstacle_radius", "drop_height")
         check_obstacle_shapes(self.obstacle_shapes, self.dim)
         check_surroundings(self)

@@ -33,6 +33,11 @@ CONFIG = make()
 SEEDS = range(30)
 
 
+def test_a_density_of_no_material_is_refused():
+    with pytest.raises(ValueError, match="density of snwo: no material; materials are sand, snow"):
+        make(density={**DENSITY, "snwo": 400.0})
+
+
 @pytest.fixture(scope="module")
 def scenes():
     return [CONFIG.sample({"sand": 30.0}, seed) for seed in SEEDS]
