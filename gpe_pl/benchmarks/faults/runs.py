@@ -28,6 +28,7 @@ import torch
 from gpe_pl.benchmarks.faults import isolation, stores
 from gpe_pl.benchmarks.faults.verdict import MAX_DETAIL, Fault, Verdict
 from gpe_pl.errors import GpeError
+from gpe_pl.evaluation.rollout_cost import COST_FILE
 from gpe_pl.learned.checkpoint_file import load_checkpoint
 from gpe_pl.system.provenance import PROVENANCE
 
@@ -90,7 +91,7 @@ class Command:
 def digests(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of results that must not depend on interruptions: data, metrics, tables, weights and the optimiser's state, bit for bit.
 
-    Logs and provenance differ between the starts of a run, so they are left out.
+    Logs and provenance differ between the starts of a run, so they are left out. So are measured times.
     """
     found = {}
     for path in _final_files(folder):
@@ -104,6 +105,8 @@ def digests(folder: Path) -> dict[str, str]:
         elif path.name == MEASURED:
             values = json.loads(path.read_text(encoding="utf-8"))
             found[name] = _digest([values["settings"], len(values["records"])])
+        elif path.name == COST_FILE:
+            found[name] = _digest(sorted(json.loads(path.read_text(encoding="utf-8"))))
         elif path.suffix == ".json":
             values = json.loads(path.read_text(encoding="utf-8"))
             found[name] = _digest({k: v for k, v in values.items() if k != "folder"} if path.name == "report.json" else values)

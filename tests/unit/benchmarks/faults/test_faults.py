@@ -416,6 +416,15 @@ def test_a_path_in_a_checkpoint_must_not_change_results(
     assert all(after[key] == before[key] or CANARY in str(after[key]) for key in before)  # another number would change results, too
 
 
+def test_the_measured_cost_of_rollouts_is_no_result_that_repeats(tmp_path: Path) -> None:
+    path, found = tmp_path / "runs" / "fit" / "rollout_cost.json", []
+    path.parent.mkdir(parents=True)
+    for text in ('{"seconds_per_step": 1.0, "sha256": "a"}', '{"seconds_per_step": 2.0, "sha256": "b"}', "{}"):
+        path.write_text(text)
+        found.append(runs.digests(tmp_path))
+    assert found[0] == found[1] != found[2]
+
+
 @pytest.mark.parametrize("attack", [runs.full_disk, runs.file_limit])
 def test_a_command_that_succeeds_on_a_full_disk_is_noticed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, attack: Callable[..., Verdict]
