@@ -135,7 +135,12 @@ def test_a_sound_trajectory_is_accepted(drifting: Path, tmp_path: Path, monkeypa
 def test_every_wrong_value_of_a_rollout_reaches_its_state(shard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arrays = stored_arrays(read_trajectory(shard, "00000"))
     states: list[State] = []
-    monkeypatch.setattr(LearnedSimulator, "_checked", lambda _, state, *__: states.append(state) or state)
+
+    def noted(_: LearnedSimulator, state: State, *__: object) -> State:
+        states.append(state)
+        return state
+
+    monkeypatch.setattr(LearnedSimulator, "_checked", noted)
     monkeypatch.setattr(field_values, "rollout", lambda *_: SimpleNamespace(termination=None))
     faults = [fault for seed in range(5) for fault in field_values.faults({"sand": shard}, 100 * seed) if fault.kind == "value, rollout"]
     assert {fault.name.split()[1] for fault in faults} == {f"{key}:" for key in arrays}
@@ -240,7 +245,12 @@ def test_a_wrong_configuration_has_data_of_its_own(tmp_path: Path, monkeypatch: 
     data.mkdir()
     (data / "dataset.json").touch()
     given: list[list[str]] = []
-    monkeypatch.setattr(configs, "run", lambda _, arguments, *__: given.append(arguments) or Ended(0, "seed: 0\n"))
+
+    def run(_: str, arguments: list[str], *__: float) -> Ended:
+        given.append(arguments)
+        return Ended(0, "seed: 0\n")
+
+    monkeypatch.setattr(configs, "run", run)
     for command, found in ((runs.Command("one", "simulate", ()), []), (runs.Command("other", "fit", (), str(data)), ["dataset.json"])):
         fault = configs.faults(command, 1)[0]
         shutil.rmtree(own, ignore_errors=True)
