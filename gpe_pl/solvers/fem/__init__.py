@@ -60,7 +60,7 @@ class FEM:
     """
 
     bounds: tuple[tuple[float, float], ...]
-    frame_dt: Annotated[float, Field(gt=0)] = 5e-3
+    frame_dt: Annotated[float, Field(gt=0, le=1e6)] = 5e-3
     materials: tuple[str, ...] = ("solid",)
     poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)] = 0.35
     damping: Annotated[float, Field(ge=0, le=2)] = 0.2

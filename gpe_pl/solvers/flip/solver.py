@@ -135,7 +135,7 @@ class FLIP:
 
     bounds: tuple[tuple[float, float], ...]
     grid_spacing: Annotated[float, Field(gt=0)]
-    frame_dt: Annotated[float, Field(gt=0)] = 5e-3
+    frame_dt: Annotated[float, Field(gt=0, le=1e6)] = 5e-3
     materials: tuple[str, ...] = (MATERIAL,)
     density: Annotated[float, Field(gt=0)] = 1000.0
     pic: Annotated[float, Field(ge=0, le=1)] = 0.05

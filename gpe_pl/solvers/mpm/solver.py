@@ -93,7 +93,7 @@ class MPM:
 
     bounds: tuple[tuple[float, float], ...]
     grid_spacing: Annotated[float, Field(gt=0)]
-    frame_dt: Annotated[float, Field(gt=0)] = 5e-3
+    frame_dt: Annotated[float, Field(gt=0, le=1e6)] = 5e-3
     materials: tuple[str, ...] = ("sand",)
     sand: Sand = field(default_factory=Sand)
     snow: Snow = field(default_factory=Snow)

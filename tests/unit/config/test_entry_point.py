@@ -236,6 +236,13 @@ def test_fit_names_the_value_before_it_does_anything(override: str, message: str
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("data", ["sand", "fluid", "fem"])
+def test_absurd_frame_intervals_are_named(data: str) -> None:
+    """Their squares are beyond what computers represent."""
+    with pytest.raises(ConfigError, match=r"data.solver.frame_dt=1e\+300: must be at most 1e\+06"):
+        dataset_spec(compose("simulate", f"data={data}", "data.solver.frame_dt=1e300"))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("target", ["gpe_pl.models.gpe.GEP", "os.system", "3"])
 def test_fit_takes_only_models(target: str, tmp_path: Path) -> None:
