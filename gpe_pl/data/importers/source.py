@@ -427,7 +427,7 @@ def joined(dim: int, *parts: Boundary) -> Boundary:
     if num_frames:
 
         def way(part: Boundary, name: str) -> np.ndarray:
-            now = np.asarray(getattr(part, name), np.float32)
+            now = getattr(part, name)
             return np.broadcast_to(now, (num_frames, *now.shape)) if part.motion is None else getattr(part.motion, name)
 
         motion = BoundaryMotion(*(np.concatenate([way(part, name) for part in parts], axis=1) for name in ("pos", "vel", "normal")))

@@ -12,6 +12,7 @@ import pytest
 
 from gpe_pl.data.importers import ImportFailure, ImportSettings, Report, import_dataset, save_dataset
 from gpe_pl.data.importers.sampled import degrees_of
+from gpe_pl.data.importers.source import joined
 from gpe_pl.data.position_rounding import motion_of
 from gpe_pl.data.validate import validate
 from gpe_pl.geometry.shapes import Shape, Sphere, domain_walls
@@ -240,3 +241,12 @@ def test_neighbours_of_a_moving_boundary_are_counted_where_it_is() -> None:
     boundary = Boundary.moving(path, [[-1.0, 0.0]], DT)
     trajectory = Trajectory.from_numpy(pos, DT, "sand", {"sand": 30.0}, connectivity_radius=0.2, boundary=boundary)
     assert [touching.tolist() for _, touching in degrees_of(trajectory)] == [[0, 0], [0, 0], [1, 0]]
+
+
+def test_still_walls_keep_their_precision_beside_a_moving_one() -> None:
+    far = np.array([500000.3, 4649776.2])
+    floor = Boundary.from_numpy(far + SPACING * np.array([[0, 0], [1, 0], [2, 0]]), [[0, 1]] * 3)
+    lid = Boundary.moving(far + 1 + SPACING * np.arange(4)[:, None, None] * np.ones((1, 2, 2)), [[0, -1]] * 2, DT)
+    both = joined(2, floor, lid)
+    assert both.motion is not None
+    np.testing.assert_array_equal(both.motion.pos[:, :3], np.broadcast_to(floor.pos, (4, 3, 2)))
