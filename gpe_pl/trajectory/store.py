@@ -490,6 +490,7 @@ def trajectory_in(group: h5py.Group, verify: bool = False, frames: slice | None 
     for fault in faults(arrays, names, metadata.materials, metadata.param_names, first_frame):
         raise UnsoundError(where, str(fault))
     motion = BoundaryMotion(arrays["boundary_pos"], arrays["boundary_vel"], arrays["boundary_normal"])
+    moves = open_field(group, "boundary_pos").shape[0] > 1  # a window of one frame still belongs to a motion
     boundary = Boundary(
         motion.pos[0],
         motion.vel[0],
@@ -497,7 +498,7 @@ def trajectory_in(group: h5py.Group, verify: bool = False, frames: slice | None 
         arrays["boundary_friction"],
         arrays["boundary_restitution"],
         shapes,
-        None if motion.num_frames == 1 else motion,
+        motion if moves else None,
     )
     found = Trajectory(
         metadata,

@@ -160,6 +160,14 @@ def test_the_store_keeps_it_and_reads_windows_of_it(truth: Trajectory, tmp_path:
                 np.testing.assert_array_equal(there, here.astype(np.float32))
 
 
+def test_a_window_of_one_frame_still_belongs_to_a_motion(truth: Trajectory, tmp_path: Path) -> None:
+    write_shard(tmp_path / "shard-0.h5", [truth])
+    read, cut = read_trajectory(tmp_path / "shard-0.h5", "00000", frames=slice(4, 5)), truth.frames(4, 5)
+    assert read.boundary.motion is not None and cut.boundary.motion is not None
+    assert read.boundary.motion.num_frames == cut.boundary.motion.num_frames == 1
+    np.testing.assert_array_equal(read.boundary.at(1).vel, 0.0)  # a wall stays where its motion ends
+
+
 def test_the_validator_knows_it(truth: Trajectory, tmp_path: Path) -> None:
     save_dataset(tmp_path, "paddles", train=[scene(k) for k in range(3)])
     assert validate([tmp_path / "paddles"]).violations == []
