@@ -248,6 +248,22 @@ def checked_force(force: Any, shape: tuple[int, ...]) -> np.ndarray:
     return numbers("force", force, dict(zip(("frame", "node", "dim"), shape, strict=True))).astype(np.float32)
 
 
+def checked_mass(mass: Any, num_nodes: int, force: np.ndarray | None) -> np.ndarray:
+    """Return the mass of each node [node] in kg. None stands for 1 kg.
+
+    Args:
+        mass: mass of all nodes, or of each node, in kg; None if it is not known.
+        num_nodes: number of nodes.
+        force: forces on nodes [frame, node, dim] in N; None if there are none.
+
+    Raises:
+        ArrayError: the array has another shape, a mass is not positive, or there are forces and no masses.
+    """
+    if mass is None and force is not None and force.any():
+        raise ArrayError("mass: there are forces and no masses, and a model reads force over mass; give the mass of each node [kg]")
+    return per_node("mass", 1.0 if mass is None else mass, (num_nodes,), low=float(np.finfo(np.float32).tiny))
+
+
 def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, int]:
     """Return all cells of a mesh in one array [cell, corner], and their largest dimension: 1 for lines, 2 for surfaces, 3 for volumes.
 

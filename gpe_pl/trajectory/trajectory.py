@@ -22,11 +22,11 @@ from gpe_pl.trajectory.arrays import (
     checked_bounds,
     checked_cells,
     checked_force,
+    checked_mass,
     checked_materials,
     checked_prescribed,
     flags,
     numbers,
-    per_node,
     positive,
     typical_spacing,
     velocities_of,
@@ -257,7 +257,7 @@ class Trajectory:
         params: Mapping[str, Array | Mapping[str, Array]],
         *,
         vel: Array | None = None,
-        mass: Array = 1.0,
+        mass: Array | None = None,
         bounds: Array | None = None,
         periodic: Array | None = None,
         gravity: Array | None = None,
@@ -285,7 +285,7 @@ class Trajectory:
             params: parameters of each material that occurs, in the units of ``schema.MATERIALS``: one value, or one per node of the trajectory. A material
                 has its first parameter, or several by name, ``{"elastomer": {"youngs_modulus": 1e5, "poisson_ratio": 0.3}}``.
             vel: velocities [frame, node, dim] in m/s; None takes the differences of positions. Models learn from positions only.
-            mass: mass of all nodes, or of each node [kg]; only ratios matter to a model.
+            mass: mass of all nodes, or of each node [kg]; required with forces. None stands for 1 kg, because only ratios matter to a model without forces.
             bounds: ``(low, high)`` of the domain per axis [m]; None takes the extremes of all positions. Periodic axes need bounds.
             periodic: whether space repeats, per axis; None stands for no axis.
             gravity: external acceleration [dim] in m/s²; None stands for zero. Models then learn gravity like any other force.
@@ -364,7 +364,7 @@ class Trajectory:
             pos,
             numbers("vel", vel, shape).astype(np.float32),
             codes,
-            per_node("mass", mass, (num_nodes,), low=float(np.finfo(np.float32).tiny)),
+            checked_mass(mass, num_nodes, force),
             columns,
             boundary,
             rest_pos=rest_pos,

@@ -8,8 +8,9 @@ Keys are the arguments of ``Trajectory.from_numpy``, which documents them. ``par
 ``params_{material}_{name}`` for one of several parameters, such as ``params_elastomer_poisson_ratio``. ``cells_{kind}`` stands for ``cells[kind]``.
 ``boundary_pos``, ``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` are arguments of ``Boundary.from_numpy``, or of
 ``Boundary.moving`` if ``boundary_pos`` is [frame, boundary_node, dim]. Then ``boundary_vel`` is ignored, and ``boundary_normal`` has either every frame or only
-the first. Without ``boundary_normal``, normals are estimated. Required keys are ``pos``, ``frame_dt``, ``materials`` and ``params_…``. Settings of the command
-override the files, except for the parameters that a file has. Trajectories that this package exported as ``.npz`` are read too (``exported``).
+the first. Without ``boundary_normal``, normals are estimated. Required keys are ``pos``, ``frame_dt``, ``materials`` and ``params_…``, and ``mass`` with
+forces. Settings of the command override the files, except for the parameters that a file has. Trajectories that this package exported as ``.npz`` are read
+too (``exported``).
 """
 
 from __future__ import annotations

@@ -82,6 +82,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         "frame_dt = 1/20 s is the format's, not in the files",
         f"splits are those of the source, with its seed {SPLIT_SEED}",
         "a frame before the first follows from the first velocities",
+        "masses are not in the files; 1 kg is stored for every node, so f/m are forces per node rather than accelerations",
     )
     facts = Facts(FRAME_DT, gravity=(0.0,) * DIM, notes=notes).overridden(settings)
     return Source(facts, {split: [Item(file.name, partial(_load, file)) for file in own] for split, own in published_split(files).items()})

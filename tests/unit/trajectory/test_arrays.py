@@ -46,7 +46,7 @@ def test_little_is_needed() -> None:
     assert m.connectivity_radius == pytest.approx(2 * m.spacing)
     np.testing.assert_allclose(np.array(m.bounds).T, [motion().min(axis=(0, 1)), motion().max(axis=(0, 1))])
     assert (m.gravity, m.periodic) == ((0.0, 0.0), (False, False))
-    assert (t.mass == 1).all()
+    assert (t.mass == 1).all() and (trajectory(force=np.zeros((20, 2))).mass == 1).all()
     assert len(t.boundary.pos) == 0
     assert t.state(5, history=2).velocity_history is not None
 
@@ -138,6 +138,7 @@ BAD[3, 5, 1] = np.nan
         ),
         ({"vel": np.zeros((10, 20, 3))}, r"^vel: has shape \[10, 20, 3\], expected \[frame 10, node 20, dim 2\]$"),
         ({"mass": np.zeros(20)}, "^mass: node 0 is 0, must be positive$"),
+        ({"force": np.ones((20, 2))}, "^mass: there are forces and no masses"),
         ({"mass": [1, 2]}, r"^mass: has shape \[2\], expected \[node 20\]$"),
         ({"bounds": [[0, 1]]}, r"^bounds: has shape \[1, 2\]"),
         ({"bounds": [[1, 0], [0, 1]]}, r"^bounds\[0\] = \(1.0, 0.0\) must be finite with low < high$"),
