@@ -18,6 +18,7 @@ from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.arrays import (
     RADIUS_SPACINGS,
     ArrayError,
+    check_counted_from_0,
     checked_bodies,
     checked_bounds,
     checked_cells,
@@ -342,7 +343,9 @@ class Trajectory:
         cell_dim = None
         if cells is not None:
             cells, cell_dim = checked_cells(cells, codes, dim)
-            rest_pos = numbers("rest_pos", pos[0] if rest_pos is None else rest_pos, {"node": num_nodes, "dim": dim}).astype(pos.dtype)
+            rest_pos = numbers("rest_pos", pos[0] if rest_pos is None else rest_pos, {"node": num_nodes, "dim": dim})
+            check_counted_from_0(cells, rest_pos, periodicity)
+            rest_pos = rest_pos.astype(pos.dtype)
         elif rest_pos is not None:
             raise ArrayError("rest_pos: only meshes have rest positions; pass cells too, or leave it out")
         known = None if stress is None else checked_stress(stress, pos, cells)

@@ -19,6 +19,7 @@ from gpe_pl.metrics.deformation import strain_energy
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import CELL_KINDS
+from gpe_pl.trajectory.arrays import ArrayError
 from gpe_pl.trajectory.cells import bodies, cell_edges, is_corner, kinds_of, mean_over_corners
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import read_trajectory, write_shard
@@ -152,3 +153,27 @@ def test_bodies_are_the_nodes_that_cells_connect() -> None:
     cells = np.array([[0, 5, 2, 1], [5, 10, 2, 2], [7, 8, 9, 9]], np.int32)
     assert [own.tolist() for own in bodies(cells, 12)] == [[0, 1, 2, 5, 10], [7, 8, 9]]
     assert bodies(np.empty((0, 3), np.int32), 4) == []
+
+
+def mesh_of(cells: np.ndarray, **changes: Any) -> Trajectory:
+    """Return a mesh of quadrilaterals on a lattice of 3 × 3 nodes, with a node in no cell after them."""
+    rest = 0.1 * np.concatenate([np.stack(np.meshgrid(np.arange(3), np.arange(3), indexing="ij"), axis=-1).reshape(-1, 2), [[8, 8]]])
+    pos = rest + 1e-3 * np.random.default_rng(0).normal(size=(5, *rest.shape))
+    return Trajectory.from_numpy(pos, 0.01, "elastomer", {"elastomer": 1e5}, cells=cells, **changes)
+
+
+QUADRILATERALS = np.array([[0, 3, 4, 1], [1, 4, 5, 2], [3, 6, 7, 4], [4, 7, 8, 5]])
+
+
+def test_cells_counted_from_1_beside_a_loose_node_are_refused() -> None:
+    mesh_of(QUADRILATERALS)
+    with pytest.raises(
+        ArrayError, match=r"cells: node 0 is in no cell, and the nodes of cell 0, \[1, 4, 5, 2\], .* counted from 1; subtract 1"
+    ):
+        mesh_of(QUADRILATERALS + 1)
+
+
+def test_a_loose_first_node_is_no_fault() -> None:
+    without_corner = QUADRILATERALS[1:]
+    assert without_corner.min() == 1
+    mesh_of(without_corner)
