@@ -37,6 +37,7 @@ from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.living import held, living, order_of_entry
 from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.openings import Opening
+from gpe_pl.trajectory.rest_positions import near_origin
 from gpe_pl.trajectory.state import State, Stress
 
 log = logging.getLogger(__name__)
@@ -345,7 +346,7 @@ class Trajectory:
             cells, cell_dim = checked_cells(cells, codes, dim)
             rest_pos = numbers("rest_pos", pos[0] if rest_pos is None else rest_pos, {"node": num_nodes, "dim": dim})
             check_counted_from_0(cells, rest_pos, periodicity)
-            rest_pos = rest_pos.astype(pos.dtype)
+            rest_pos = near_origin(rest_pos, pos, periodicity).astype(pos.dtype)
         elif rest_pos is not None:
             raise ArrayError("rest_pos: only meshes have rest positions; pass cells too, or leave it out")
         known = None if stress is None else checked_stress(stress, pos, cells)

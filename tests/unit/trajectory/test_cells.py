@@ -177,3 +177,28 @@ def test_a_loose_first_node_is_no_fault() -> None:
     without_corner = QUADRILATERALS[1:]
     assert without_corner.min() == 1
     mesh_of(without_corner)
+
+
+def test_rest_positions_far_from_0_and_from_all_positions_keep_their_shape() -> None:
+    near, far = mesh_of(QUADRILATERALS), np.array([500000.3, 4649776.2])
+    assert near.rest_pos is not None
+    rest = mesh_of(QUADRILATERALS, rest_pos=near.rest_pos + far).rest_pos
+    assert rest is not None and np.abs(rest).max() < 2
+    np.testing.assert_allclose(np.diff(rest.astype(np.float32), axis=0), np.diff(near.rest_pos, axis=0), atol=1e-6)
+
+
+def test_rest_positions_in_periodic_domains_move_by_whole_periods() -> None:
+    near, space = mesh_of(QUADRILATERALS), {"bounds": [[-0.3, 0.9], [-0.3, 0.9]], "periodic": [True, False]}
+    assert near.rest_pos is not None
+    rest = mesh_of(QUADRILATERALS, rest_pos=near.rest_pos + np.array([1.2 * 10**6, 0]), **space).rest_pos
+    assert rest is not None
+    np.testing.assert_allclose(rest, near.rest_pos, atol=1e-8)
+
+
+@pytest.mark.parametrize("offset", [0.4, 500000.3])
+def test_rest_positions_in_the_coordinates_of_the_positions_keep_these(offset: float) -> None:
+    near = mesh_of(QUADRILATERALS)
+    assert near.rest_pos is not None
+    rest = near.rest_pos + offset
+    there = Trajectory.from_numpy(near.pos + offset, 0.01, "elastomer", {"elastomer": 1e5}, cells=QUADRILATERALS, rest_pos=rest)
+    np.testing.assert_array_equal(there.rest_pos, rest)
