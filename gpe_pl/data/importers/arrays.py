@@ -80,7 +80,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     Raises:
         ImportFailure: there are no such files.
     """
-    folders, warnings = split_folders(path)
+    folders, warnings = split_folders(path, ".npz")
     files = {
         split: sorted(folder.glob("*.npz"), key=lambda file: natural(file.name)) for split, folder in (folders or {"train": path}).items()
     }

@@ -55,7 +55,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     Raises:
         ImportFailure: there are no decks.
     """
-    folders, warnings = split_folders(path)
+    folders, warnings = split_folders(path, ".inp")
     splits = {}
     for split, folder in (folders or {"train": path}).items():
         files = sorted(folder.glob("*.inp"), key=lambda file: natural(file.name))

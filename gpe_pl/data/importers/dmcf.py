@@ -62,7 +62,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     if path.is_file():
         scenes, warnings = {"train": [[path]]}, tuple[str, ...]()
     else:
-        folders, warnings = split_folders(path)
+        folders, warnings = split_folders(path, ENDING)
         scenes = {split: _scenes(folder) for split, folder in (folders or {"train": path}).items()}
     if not any(scenes.values()):
         raise ImportFailure(f"{path}: {'no such file or folder' if not path.exists() else f'holds no *{ENDING}'}")

@@ -562,10 +562,10 @@ def split_files(path: Path, endings: Sequence[str]) -> dict[str, Path]:
     return found
 
 
-def split_folders(path: Path) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Return the folders ``train``, ``valid``, ``test`` … in a folder, by split (``SPLIT_NAMES``), and a warning for each other folder.
+def split_folders(path: Path, *endings: str) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Return the folders ``train``, ``valid``, ``test`` … in a folder, by split (``SPLIT_NAMES``), and warnings of what is beside them.
 
-    Without any such folder there are no warnings.
+    There is a warning for each other folder, and one for files with one of the endings. Without any folder of a split there are no warnings.
 
     Raises:
         ImportFailure: a split has two folders.
@@ -575,7 +575,11 @@ def split_folders(path: Path) -> tuple[dict[str, Path], tuple[str, ...]]:
     folders = {entry.name: entry for entry in path.iterdir() if entry.is_dir() and not entry.name.startswith(".")}
     found = _one_each(path, [(split, folders[name]) for name, split in SPLIT_NAMES.items() if name in folders])
     others = sorted({*folders} - {*SPLIT_NAMES})
-    return found, tuple(f"{name}/ was not read: splits are {', '.join(SPLIT_NAMES)}" for name in others) if found else ()
+    warnings = [f"{name}/ was not read: splits are {', '.join(SPLIT_NAMES)}" for name in others]
+    if loose := sorted((entry.name for entry in path.iterdir() if entry.is_file() and entry.name.endswith(endings)), key=natural):
+        folder = next(iter(found.values())).name if found else ""
+        warnings.append(f"{len(loose)} files beside {folder}/ were not read, the first is {loose[0]}: move them into the folder of a split")
+    return found, tuple(warnings) if found else ()
 
 
 def _one_each(path: Path, found: Sequence[tuple[str, Path]]) -> dict[str, Path]:

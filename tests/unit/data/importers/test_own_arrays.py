@@ -95,6 +95,14 @@ def test_unseen_splits_and_folders_that_are_none(tmp_path: Path) -> None:
     assert any(w.startswith("train_more/ was not read") for w in report.warnings)
 
 
+def test_files_beside_the_folders_of_splits_are_named(tmp_path: Path) -> None:
+    for seed, split in enumerate(("train", "val", "test", ".", ".")):
+        write_arrays(tmp_path / "raw" / split, seed)
+    (tmp_path / "raw" / "readme.txt").touch()
+    report, _ = imported(tmp_path, tmp_path / "raw", "arrays")
+    assert "2 files beside train/ were not read, the first is 3.npz: move them into the folder of a split" in report.warnings
+
+
 @pytest.mark.slow
 def test_a_scene_that_is_in_two_splits_stays_in_training(tmp_path: Path) -> None:
     for folder, seeds in {"train": (0, 1, 2), "test": (2, 3), "val": (4,)}.items():
