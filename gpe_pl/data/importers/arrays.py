@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.data.importers import exported, npz
+from gpe_pl.data.importers.given_values import merged, replaced
 from gpe_pl.data.importers.source import (
     Facts,
     ImportFailure,
@@ -32,7 +33,6 @@ from gpe_pl.data.importers.source import (
     Refusal,
     Source,
     joined,
-    merged,
     natural,
     split_folders,
     walls_at_bounds,
@@ -135,10 +135,11 @@ def _load(path: Path, stated: Facts, facts: Facts) -> Loaded:
     own_bounds = None if stated.bounds is not None else values.get("bounds")  # later, all files have the bounds that enclose theirs
     given = {"frame_dt", "bounds", "periodic", "gravity", "spacing", "connectivity_radius"}
     values |= {name: value for name in given if (value := getattr(facts, name)) is not None}
-    values["params"] = merged({m: v for m, v in facts.parameters.items() if m in np.unique(values["materials"])}, own)
+    given_values = {m: v for m, v in facts.parameters.items() if m in np.unique(values["materials"])}
+    values["params"] = merged(given_values, own)
     space = _periodicity(values)
     wall = {name.removeprefix("boundary_"): values.pop(name) for name in names if name.startswith("boundary_")}
-    notes: list[str] = []
+    notes = [*replaced(given_values, own)]
     if wall:
         if "pos" not in wall:
             raise Refusal("has boundary arrays but no 'boundary_pos'")

@@ -14,6 +14,7 @@ import numpy as np
 
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.free_flight import joined, vector
+from gpe_pl.data.importers.given_values import without_effect
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
 from gpe_pl.data.importers.sampled import degrees_of, speed_and_acceleration
 from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
@@ -224,6 +225,7 @@ class _Conversion:
                 self.report.notes += [note for note in loaded.notes if note not in self.report.notes]
         self.report.refusals += self.survey.refused_as_incomplete()
         self.report.notes = [*self.facts.notes, *self.report.notes]
+        self.report.warnings += without_effect(self.about["settings"], self.survey.materials, self.survey.types)
 
     def _load(self, item: Item) -> Loaded:
         if self.on_progress is not None:

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from gpe_pl.data.importers.given_values import merged, replaced
 from gpe_pl.errors import GpeError
 from gpe_pl.files import regular_files
 from gpe_pl.files.json_text import parsed
@@ -160,16 +161,6 @@ class Facts:
         return replace(self, **given, parameters=merged(self.parameters, settings.parameters or {}), notes=notes)
 
 
-def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Return parameters by material; values of the second mapping have precedence, parameter by parameter."""
-    both: dict[str, Any] = {**first, **second}
-    for material in first.keys() & second.keys() & MATERIALS.keys():
-        own = MATERIALS[material][0].name
-        by_name = [values if isinstance(values, Mapping) else {own: values} for values in (first[material], second[material])]
-        both[material] = {**by_name[0], **by_name[1]}
-    return both
-
-
 @dataclass(frozen=True)
 class Repair:
     """A change that was necessary to store a trajectory.
@@ -193,6 +184,7 @@ class Loaded:
         notes: assumptions about the whole data set.
         warnings: what looks wrong about the trajectory.
         assumes_gravity: whether its gravity is the usual one of the format, because neither source nor settings state one.
+        types: node types of the source that occur in it, if the format has such types.
     """
 
     trajectory: Trajectory
@@ -200,6 +192,7 @@ class Loaded:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     assumes_gravity: bool = False
+    types: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -249,7 +242,7 @@ class Nodes:
         stress: Cauchy stress at nodes [frame, node, component] in Pa.
         moving_walls: positions and normals [frame, boundary_node, dim] of additional boundary nodes that move in a prescribed way.
         friction: friction coefficient of boundary nodes.
-        repairs, notes, warnings: as in ``Loaded``.
+        types, repairs, notes, warnings: as in ``Loaded``.
     """
 
     pos: np.ndarray
@@ -268,6 +261,7 @@ class Nodes:
     stress: np.ndarray | None = None
     moving_walls: tuple[np.ndarray, np.ndarray] | None = None
     friction: float = ASSUMED_FRICTION
+    types: frozenset[int] = frozenset()
     repairs: list[Repair] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -298,6 +292,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
     warnings = [*nodes.warnings, *_wider_than_periods(pos[0], periodicity)]
     kinds = [str(k) for k in nodes.kind[moving]]
     parameters: dict[str, Any] = {}
+    notes += replaced(facts.parameters, {material: values for material, values in nodes.parameters.items() if material in kinds})
     for material in dict.fromkeys(kinds):
         first = MATERIALS[material][0]
         given = merged(facts.parameters, nodes.parameters).get(material, {})
@@ -342,6 +337,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
         (*notes, *wall_notes),
         tuple(warnings),
         assumes_gravity,
+        nodes.types,
     )
 
 
@@ -482,8 +478,9 @@ def typed(pos: np.ndarray, types: np.ndarray, table: Mapping[int, str], settings
             f"node {node} has type {unknown[0]}; known: {', '.join(map(str, sorted(known)))}. Name it with materials={{{unknown[0]}: …}}"
         )
     kind = np.array([known[code] for code in types.tolist()], dtype="U16")
-    notes = [f"type {code} of the source is stored as {known[code]} (materials={{{code}: …}})" for code in np.unique(types).tolist()]
-    return Nodes(pos, kind, notes=notes, **arrays)
+    found = frozenset(types.tolist())
+    notes = [f"type {code} of the source is stored as {known[code]} (materials={{{code}: …}})" for code in sorted(found)]
+    return Nodes(pos, kind, types=found, notes=notes, **arrays)
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -51,6 +51,7 @@ class Survey:
     Attributes:
         good: usable trajectories by split.
         materials: materials of all trajectories.
+        types: node types of the source that occur in any trajectory.
         columns: names of the parameters of all trajectories.
         stressed: materials with a stress in any trajectory.
         loads: loads that any trajectory has.
@@ -72,6 +73,7 @@ class Survey:
 
     good: dict[str, list[Item]] = field(default_factory=dict)
     materials: set[str] = field(default_factory=set)
+    types: set[int] = field(default_factory=set)
     columns: set[str] = field(default_factory=set)
     stressed: set[str] = field(default_factory=set)
     loads: set[str] = field(default_factory=set)
@@ -153,6 +155,7 @@ class Survey:
         self.nearest.append((split, name, float(np.median(there)) if len(there) else np.inf))
         self.lengths.append((split, name, trajectory.num_frames))
         self.materials |= set(m.materials)
+        self.types |= loaded.types
         self.columns |= set(m.param_names)
         self.loads |= set(m.loads or ())
         self.stressed |= set(m.with_stress if trajectory.stress is not None else ())

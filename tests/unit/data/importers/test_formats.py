@@ -139,6 +139,7 @@ def test_what_a_number_means_can_be_said(tmp_path: Path) -> None:
     assert trajectory.metadata.materials == ("elastomer",)
     assert (trajectory.material_params == 5e4).all()
     assert "frame_dt = 0.02 was given" in report.notes
+    assert not [warning for warning in report.warnings if "has no effect" in warning]
     assert (
         "there is no split val and no split test; fit needs train, val and test, or three trajectories of train to take them from"
         in report.warnings
