@@ -36,6 +36,10 @@ BINARY = {
     ".xyz": "write it as .npy",
     ".csv": "write it as .npy",
 }
+FEWEST_POINTS = 100
+"""An array in an NPY file with 3 columns and fewer rows may be a height map as well as a point cloud, and is refused."""
+OFF_UNIT = 0.01
+"""Largest deviation from 1 of the lengths of unit normals, which may be rounded in text."""
 HEADER_BYTES = 2**16
 """Number of bytes at the start of a PLY file that are searched for the numbers of elements."""
 
@@ -215,12 +219,25 @@ def _cloud(path: Path, points: np.ndarray, normals: np.ndarray | None) -> Cloud:
 
 
 def _read_xyz(path: Path) -> Cloud:
-    return _columns(path, np.loadtxt(path, ndmin=2))
+    values = np.loadtxt(path, ndmin=2)
+    if values.ndim != 2 or values.shape[1] not in (3, 6):
+        raise TerrainError(f"{path}: a point cloud has 3 columns, or 6 with normals, got an array {list(values.shape)}")
+    if (
+        values.shape[1] == 6 and (values[:, 3:] >= 0).all() and (row := _not_unit(values[:, 3:])) is not None
+    ):  # normals of other lengths have signs
+        raise TerrainError(
+            f"{path}: columns 4 to 6 are no unit normals, point {row} has {values[row, 3:].tolist()}; are they colours? Write 3 columns only"
+        )
+    return _columns(path, values)
+
+
+def _not_unit(normals: np.ndarray) -> int | None:
+    """Return the first row of normals [point, 3] whose length is not 1; None if there is none."""
+    is_unit = np.abs(np.linalg.norm(normals, axis=-1) - 1) <= OFF_UNIT
+    return None if is_unit.all() else int(is_unit.argmin())
 
 
 def _columns(path: Path, values: np.ndarray) -> Cloud:
-    if values.ndim != 2 or values.shape[1] not in (3, 6):
-        raise TerrainError(f"{path}: a point cloud has 3 columns, or 6 with normals, got an array {list(values.shape)}")
     return _cloud(path, values[:, :3], values[:, 3:] if values.shape[1] == 6 else None)
 
 

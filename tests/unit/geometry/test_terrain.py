@@ -334,7 +334,9 @@ def test_contained_height_map_keeps_its_proportions(tmp_path: Path) -> None:
         ("a.xyz", b"1 2 3\n3 4 5\n", "at least 3 points"),
         ("a.xyz", b"0 0 0\n1 1 1\n2 2 2\n3 3 3\n", "on one line"),
         ("a.xyz", b"0 0 0\n1 1 1\n2 2 2\n1 2 inf\n", "not finite"),
-        ("a.xyz", b"0 0 0 0 0 1\n1 0 0 0 0 0\n1 1 0 0 0 1\n", "normal 1 has no length"),
+        ("a.xyz", b"0 0 0 0 0 1\n1 0 0 0 0 0\n1 1 0 0 0 -1\n", "normal 1 has no length"),
+        ("a.xyz", b"0 0 0 0 0 1\n1 0 0 99 90 60\n1 1 0 0 0 1\n", r"columns 4 to 6 are no unit normals, point 1 has \[99.0, .*colours"),
+        ("a.xyz", b"0 0 0 .9 .8 .7\n1 0 0 .9 .9 .6\n1 1 0 0 0 0\n", "columns 4 to 6 are no unit normals, point 0"),
     ],
 )
 def test_unusable_files_are_refused(tmp_path: Path, name: str, content: bytes, message: str) -> None:
