@@ -36,10 +36,11 @@ def read_terrain(
     """Read the terrain in a file as signed distances at grid nodes that cover the domain.
 
     * Triangle meshes: OBJ, STL, PLY.
-    * Point clouds: PLY without faces; XYZ (text) and NPY with 3 columns, or with 6 columns that include normals into free space; NPZ with ``points`` and
+    * Point clouds: PLY without faces; XYZ (text) and NPY with 3 columns, or with 6 columns that include unit normals into free space; NPZ with ``points`` and
       optionally ``normals``. Without normals the ground is the height field through the points.
     * Height maps, seen from above with north up (columns along x, rows against y): NPY with another number of columns, NPZ with
       ``heights``, CSV, PNG (the largest possible grey value is 1).
+    * NPY with 3 columns and fewer than ``terrain_files.FEWEST_POINTS`` rows, or with 6 columns without unit normals, may be either: it is refused.
 
     Args:
         path: the file; its extension determines the format.

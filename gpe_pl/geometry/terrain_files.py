@@ -254,7 +254,14 @@ def _height_map(path: Path, rows: np.ndarray) -> Heights:
 
 def _read_npy(path: Path) -> Cloud | Heights:
     values = np.load(path, mmap_mode="r", allow_pickle=False)  # raises if the header promises more than the file contains
-    return _columns(path, values) if values.ndim == 2 and values.shape[1] in (3, 6) else _height_map(path, values)
+    columns = values.shape[1] if values.ndim == 2 else 0
+    if (columns == 3 and len(values) < FEWEST_POINTS) or (columns == 6 and _not_unit(values[:, 3:]) is not None):
+        why = f"with fewer than {FEWEST_POINTS} rows" if columns == 3 else "without unit normals in columns 4 to 6"
+        raise TerrainError(
+            f"{path}: an array {list(values.shape)} {why} may be a height map or a point cloud; write an .npz file with 'heights', or with 'points' and "
+            "possibly 'normals'"
+        )
+    return _columns(path, values) if columns in (3, 6) else _height_map(path, values)
 
 
 def _read_npz(path: Path) -> Cloud | Heights:

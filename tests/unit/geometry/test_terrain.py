@@ -350,6 +350,23 @@ def test_unusable_files_are_refused(tmp_path: Path, name: str, content: bytes, m
     assert isinstance(caught.value, ValueError)
 
 
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ((40, 3), r"array \[40, 3\] with fewer than 100 rows may be a height map or a point cloud; write an .npz file with 'heights'"),
+        ((40, 6), r"array \[40, 6\] without unit normals in columns 4 to 6 may be a height map"),
+        ((4000, 6), r"array \[4000, 6\] without unit normals"),
+    ],
+)
+def test_arrays_that_may_be_maps_or_clouds_are_refused(tmp_path: Path, shape: tuple[int, int], message: str) -> None:
+    values = np.random.default_rng(0).uniform(size=shape)
+    np.save(tmp_path / "a.npy", values)
+    with pytest.raises(TerrainError, match=message):
+        read_terrain(tmp_path / "a.npy", UNIT, 0.25)
+    np.savez(tmp_path / "a.npz", heights=values)
+    read_terrain(tmp_path / "a.npz", UNIT, 0.25)
+
+
 def test_missing_and_large_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(TerrainError, match="no such file"):
         read_terrain(tmp_path / "a.csv", UNIT, 0.25)
