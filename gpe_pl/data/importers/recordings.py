@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, UInt64
 
 from gpe_pl.data.importers.source import Item
 from gpe_pl.geometry.periodicity import Periodicity
+from gpe_pl.trajectory.rest_positions import COARSE
 from gpe_pl.trajectory.trajectory import Trajectory
 
 NUM_FOLLOWED = 64
@@ -145,10 +146,23 @@ def _follows(
 
 
 def _digest(pos: Float[np.ndarray, "node dim"]) -> np.uint64:
-    """Return a digest of positions, in the precision of the store: the sum of the digests of the nodes."""
-    bits = (np.ascontiguousarray(pos, np.float32) + np.float32(0)).view(np.uint32).astype(np.uint64)  # adding zero turns -0 into 0
+    """Return a digest of positions, in the precision of the store: the sum of the digests of the nodes, and of their origin as a further one."""
+    origin = _origin(pos)
+    seen = np.concatenate([pos - origin, origin[None]])
+    bits = (np.ascontiguousarray(seen, np.float32) + np.float32(0)).view(np.uint32).astype(np.uint64)  # adding zero turns -0 into 0
     digests = (bits * _FACTORS[: pos.shape[1]]).sum(axis=1)
     digests ^= digests >> np.uint64(33)
     digests *= _MIX
     digests ^= digests >> np.uint64(29)
     return np.uint64(digests.sum())
+
+
+def _origin(pos: Float[np.ndarray, "node dim"]) -> Float[np.ndarray, "dim"]:
+    """Return a round point near the nodes if they are so far from 0 that float32 does not tell them apart, and 0 otherwise."""
+    low, high = pos.min(axis=0).astype(np.float64), pos.max(axis=0).astype(np.float64)
+    width = float((high - low).max())
+    farthest = np.maximum(np.abs(low), np.abs(high))
+    if width == 0 or not (np.spacing(farthest.astype(np.float32)) > COARSE * width).any():
+        return np.zeros(len(low))
+    step = 10.0 ** np.ceil(np.log10(width))
+    return step * np.rint((low + high) / 2 / step)

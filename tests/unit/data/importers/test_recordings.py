@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gpe_pl.data.importers.recordings import Part
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests.unit.data.importers.test_formats import imported
 
 DT, NUM_FRAMES, LANDS = 0.01, 40, 20
@@ -66,6 +68,22 @@ PART = "1 of 1 trajectories is of a recording that is also in another split, the
 def test_parts_of_one_recording(tmp_path: Path, train: np.ndarray, val: np.ndarray, said: str | None) -> None:
     found = warnings(tmp_path, train=[train], val=[val], test=[C])
     assert [w.split(": errors there")[0] for w in found] == ([] if said is None else [f"val: {PART}{said}"])
+
+
+def test_scenes_far_from_0_differ_by_less_than_their_rounding_there() -> None:
+    def digests(pos: np.ndarray) -> np.ndarray:
+        return Part.of(Trajectory.from_numpy(pos, DT, "sand", {"sand": 30.0})).digests
+
+    there = np.array([500_000.3, 4_649_776.4])
+    first, second = (digests(START + there + 1e-3 * np.sin(0.3 * seed + np.arange(5.0)[:, None, None])) for seed in (0, 1))
+    assert not {*first.tolist()} & {*second.tolist()} and len({*first.tolist()}) == 5
+    np.testing.assert_array_equal(
+        digests(START[None, ::-1] + there + np.zeros((3, 1, 1))), digests(START[None] + there + np.zeros((3, 1, 1)))
+    )
+    assert (
+        digests(START[None] + there + np.zeros((3, 1, 1)))[0]
+        != digests(START[None] + there + np.array([1.0, 0.0]) + np.zeros((3, 1, 1)))[0]
+    )
 
 
 @pytest.mark.slow
