@@ -20,6 +20,8 @@ Arrays are found by their names. ``arrays={displacement: U, stress: S}`` names t
 - ``material`` of points: numbers, which ``materials={1: elastomer}`` names. Without it, all have number 0, which is ``solid`` for meshes.
 - Parameters of materials at points or in cells, such as ``youngs_modulus`` and ``poisson_ratio``.
 
+Points keep their rows in all frames. Where rows change, numbers of points such as ``id`` or ``GlobalNodeId`` say which is which, see ``same_mesh``.
+
 Scenes whose points all have the third coordinate 0 are two-dimensional. Cells are lines, triangles, quadrilaterals, tetrahedra, wedges and hexahedra; others
 are refused. Cells on the surface of others, such as the triangles that mesh generators write beside tetrahedra, are left out. The importer needs ``meshio``
 (``pip install 'gpe_pl[import]'``).
@@ -44,6 +46,7 @@ from gpe_pl.data.importers.meshes import (
     sizes,
     without_faces,
 )
+from gpe_pl.data.importers.same_mesh import in_one_order
 from gpe_pl.data.importers.source import (
     Facts,
     ImportFailure,
@@ -122,7 +125,7 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
         raise Refusal(f"has {len(frames)} frames; a trajectory needs at least 3")
     if frames[0].time is not None:
         check_intervals(np.array([frame.time for frame in frames], float), facts, "write results at even intervals")
-    _check_same_mesh(frames)
+    frames = in_one_order(frames)
     arrays = _Arrays(frames, settings.arrays or {})
     pos, rest = _positions(frames, arrays)
     planar = not pos[..., 2:].any() and not rest[..., 2:].any() and not {"tetrahedron", "wedge", "hexahedron"} & {*frames[0].cells}
@@ -153,19 +156,6 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
         if own:
             nodes.parameters = {**nodes.parameters, material: own}
     return build(nodes, facts)
-
-
-def _check_same_mesh(frames: list[Frame]) -> None:
-    """Raise ``Refusal`` if a frame has other points or cells than the first."""
-    first = frames[0]
-    for k, frame in enumerate(frames):
-        if frame.points.shape != first.points.shape:
-            raise Refusal(f"{frame.file} has {len(frame.points)} points, {first.file} has {len(first.points)}; meshes must not change", k)
-        same = frame.cells.keys() == first.cells.keys() and all(
-            np.array_equal(frame.cells[kind], first.cells[kind]) for kind in first.cells
-        )
-        if not same:
-            raise Refusal(f"{frame.file} has other cells than {first.file}; meshes must not change", k)
 
 
 def _positions(frames: list[Frame], arrays: _Arrays) -> tuple[np.ndarray, np.ndarray]:

@@ -447,6 +447,61 @@ def test_a_collection_must_not_leave_its_folder(tmp_path: Path) -> None:
         imported(tmp_path, frame_dt=DT)
 
 
+def test_rows_that_change_are_followed_by_their_numbers(tmp_path: Path) -> None:
+    """Also the cells, and values of points."""
+
+    def edit(mesh: Any, frame: int) -> Any:
+        order = np.roll(np.arange(len(POINTS)), frame)
+        data = {name: values[order] for name, values in mesh.point_data.items()} | {"GlobalNodeIds": 100 - order}
+        return meshio.Mesh(POINTS[order], [("hexahedron", np.argsort(order)[CELLS])], point_data=data, cell_data=mesh.cell_data)
+
+    write_folder(tmp_path / "raw", edit)
+    found = imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
+    np.testing.assert_allclose(found.pos - found.pos[0], displacement(POINTS), atol=1e-6)
+    np.testing.assert_allclose(found.vel, 3 * displacement(POINTS), atol=1e-6)
+    assert found.cells is not None and found.cells.tolist() == CELLS.tolist()
+
+
+def test_particles_whose_rows_change_are_followed(tmp_path: Path) -> None:
+    (tmp_path / "raw" / "a").mkdir(parents=True)
+    for frame in range(FRAMES):
+        order = np.random.default_rng(frame).permutation(len(FLAT))
+        pos, numbers = (FLAT + displacement(FLAT)[frame])[order], order[:, None].astype(float)
+        body = {"id": np.ones(len(FLAT), int), "Particle_ID": numbers}  # the first numbers no points
+        meshio.Mesh(pos, [("vertex", np.arange(len(FLAT))[:, None])], point_data=body).write(tmp_path / "raw" / "a" / f"{frame}.vtu")
+    found = imported(tmp_path, frame_dt=DT, materials={0: "sand"})
+    order = np.random.default_rng(0).permutation(len(FLAT))
+    np.testing.assert_allclose(found.pos - found.pos[0], displacement(FLAT)[:, order, :2], atol=1e-6)
+
+
+def numbered(numbers: Callable[[int], np.ndarray | None]) -> Callable[[Any, int], Any]:
+    """Return an edit that adds numbers of points, by frame."""
+
+    def edit(mesh: Any, frame: int) -> Any:
+        if (own := numbers(frame)) is not None:
+            mesh.point_data["ids"] = own
+        return mesh
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        (lambda k: np.arange(12) + (k > 3), "step_4.vtu: array 'ids' has other numbers of points than step_0.vtu, such as 0; write the same points"),
+        (lambda k: np.roll(np.arange(12) // 2, k), "step_1.vtu: array 'ids' differs from step_0.vtu and has numbers twice"),
+        (lambda k: np.arange(12) if k < 2 else np.arange(12) // 2, "step_2.vtu: array 'ids' has other numbers of points than step_0.vtu, such as 6"),
+        (lambda k: np.arange(12) if k < 2 else None, "step_2.vtu has no array 'ids' of whole numbers, step_0.vtu has one; write it in all frames"),
+    ],
+)  # fmt: skip
+def test_numbers_of_points_that_do_not_tell_which_is_which_are_refused(
+    tmp_path: Path, numbers: Callable[[int], np.ndarray | None], message: str
+) -> None:
+    write_folder(tmp_path / "raw", numbered(numbers))
+    with pytest.raises(ImportFailure, match=message):
+        imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
+
+
 def test_names_of_arrays_belong_to_this_format(tmp_path: Path) -> None:
     with pytest.raises(ImportFailure, match="only format=meshio finds arrays by their names"):
         import_dataset(tmp_path, ImportSettings("gns", str(tmp_path), "set", arrays={"stress": "S"}))
