@@ -8,6 +8,8 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -42,7 +44,8 @@ EXODUS_KINDS = {
 """Names in meshio of cells by the first three letters of their names in Exodus."""
 DECIMAL = re.compile(r"([0-9]+(?:[.][0-9]+)?(?:e[-+][0-9]+)?)", re.IGNORECASE)
 """A number, which may have decimals and an exponent."""
-WHOLE = re.compile(r"[0-9]+")
+WHOLE = 1e-6
+"""Multiples of the usual step between numbers are whole within this margin."""
 COMPONENTS = (("xx", "yy", "zz", "xy", "yz", "xz"), ("xx", "yy", "zz", "xy", "yz", "zx"), ("x", "y", "z"), ("x", "y"))
 """Endings of the names of the components of tensors, in VTK's order, and of vectors."""
 WEDGE = [0, 2, 1, 3, 5, 4]
@@ -131,31 +134,58 @@ def _in_order(files: list[Path]) -> list[Path]:
     """Return files in the order of the numbers in their names.
 
     Raises:
-        Refusal: the order depends on whether ``0.1`` is a number with decimals or two numbers, or a number is missing.
+        Refusal: names differ elsewhere than in one number, the order depends on whether ``0.1`` is a number with decimals or two numbers, or a number is
+            missing or occurs twice.
     """
     ordered = sorted(files, key=lambda file: natural(file.name))
-    by_value = sorted(ordered, key=lambda file: [float(part) if k % 2 else part for k, part in enumerate(DECIMAL.split(file.stem))])
+    if len(ordered) < 2:
+        return ordered
+    numbers = _numbers(ordered)
+    by_value = [file for _, file in sorted(zip(numbers, ordered, strict=True), key=lambda pair: pair[0])]
     for whole, decimal in zip(ordered, by_value, strict=True):
         if whole != decimal:
             raise Refusal(
                 f"{whole.name} and {decimal.name}: the order of files is not clear, because their numbers have decimals; number them 0, 1, 2, …, or list them "
                 "with their times in a PVD file"
             )
-    _require_all_numbers(ordered)
+    _require_all_numbers(ordered, numbers)
     return ordered
 
 
-def _require_all_numbers(files: list[Path]) -> None:
-    """Raise a refusal for numbers such as 0, 1, 2, 4, 5. Numbers without a common step, such as those of iterations, say nothing."""
-    numbers = [int(found[-1]) for file in files if (found := WHOLE.findall(file.stem))]
-    steps = np.diff(numbers)
-    if len(numbers) < len(files) or len(steps) < 3 or steps.min() <= 0:
-        return
-    usual, largest = int(np.median(steps)), int(np.argmax(steps))
-    if steps.min() == usual < steps[largest] and (steps % usual == 0).all():
+def _numbers(files: list[Path]) -> list[Decimal]:
+    """Return the number in which the names of the files of one series differ.
+
+    Raises:
+        Refusal: names differ elsewhere, so the files may be of several series.
+    """
+    parts = [DECIMAL.split(file.name) for file in files]
+    counting = max((k for k in range(1, min(map(len, parts)), 2) if len({own[k] for own in parts}) > 1), default=1)
+    around = [own[:counting] + own[counting + 1 :] for own in parts]
+    for file, own in zip(files, around, strict=True):
+        if own != around[0]:
+            raise Refusal(
+                f"{files[0].name} and {file.name}: names of the frames of a series differ in one number only; give each series a folder of its own, without "
+                "other files"
+            )
+    return [Decimal(own[counting]) for own in parts]
+
+
+def _require_all_numbers(files: list[Path], numbers: list[Decimal]) -> None:
+    """Raise a refusal for numbers such as 0, 1, 2, 4, 5, or 0, 1, 1, 2. Numbers without a common step, such as those of iterations, say nothing."""
+    steps = np.array([float(after - before) for before, after in pairwise(numbers)])
+    if steps.min() <= 0:
+        twice = int(np.argmin(steps))
+        raise Refusal(f"{files[twice].name} and {files[twice + 1].name} have the same number; number the frames 0, 1, 2, …")
+    multiples, largest = steps / np.median(steps), int(np.argmax(steps))
+    if (
+        len(steps) >= 3
+        and abs(multiples - np.rint(multiples)).max() < WHOLE
+        and multiples.min() > 1 - WHOLE
+        and multiples.max() > 1 + WHOLE
+    ):
         raise Refusal(
-            f"between {files[largest].name} and {files[largest + 1].name}, files are missing: other numbers rise by {usual}; give all files, or list them "
-            "with their times in a PVD file"
+            f"between {files[largest].name} and {files[largest + 1].name}, files are missing: other numbers rise by {np.median(steps):g}; give all files, or "
+            "list them with their times in a PVD file"
         )
 
 

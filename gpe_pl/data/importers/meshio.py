@@ -5,7 +5,8 @@
 - ``NAME.pvd`` with the VTU files that it lists, as ParaView writes them,
 - ``NAME.xdmf`` or ``NAME.xmf`` with a series in time,
 - ``NAME.e``, ``NAME.ex2`` or ``NAME.exo``: Exodus with all times, which also needs the package netCDF4, or
-- a folder ``NAME/`` with one file per frame in the order of their numbers, of any format that meshio reads; ``frame_dt`` has to be given.
+- a folder ``NAME/`` with one file per frame, of any format that meshio reads. Their names differ in one number, which gives their order. ``frame_dt`` has to be
+  given.
 
 Arrays are found by their names. ``arrays={displacement: U, stress: S}`` names those that are called otherwise in the files:
 

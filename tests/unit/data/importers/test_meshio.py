@@ -326,6 +326,30 @@ def test_a_missing_number_is_told(tmp_path: Path, numbers: str, missing: tuple[s
             imported(tmp_path, frame_dt=DT)
 
 
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ("a_0.vtu a_1.vtu a_2.vtu b_0.vtu b_1.vtu b_2.vtu", "a_0.vtu and b_0.vtu: names of the frames of a series differ in one number only; give each"),
+        ("run1_0.vtu run1_1.vtu run2_0.vtu run2_1.vtu", "run1_0.vtu and run2_0.vtu: names of the frames of a series differ in one number only"),
+        ("run1.000.vtu run1.001.vtu run1.002.vtu run2.000.vtu run2.001.vtu", "between run1.002.vtu and run2.000.vtu, files are missing"),
+        ("0.vtk 0.vtu 1.vtk 1.vtu 2.vtk 2.vtu", "0.vtk and 0.vtu: names of the frames of a series differ in one number only"),
+        ("start.vtu a_0.vtu a_1.vtu", "a_0.vtu and start.vtu: names of the frames of a series differ in one number only"),
+        ("a_0.vtu a_1.vtu a_01.vtu a_2.vtu", "a_01.vtu and a_1.vtu have the same number; number the frames 0, 1, 2"),
+        ("a_0001_0.vtu a_0002_0.vtu a_0003_0.vtu", ""),  # of part 0
+        ("a_0.90.vtu a_0.95.vtu a_1.00.vtu a_1.05.vtu", ""),
+    ],
+)  # fmt: skip
+def test_a_folder_has_the_files_of_one_series(tmp_path: Path, names: str, message: str) -> None:
+    (tmp_path / "raw" / "a").mkdir(parents=True)
+    for frame, name in enumerate(names.split()):
+        meshio.Mesh(FLAT + frame * SIZE, [("triangle", TRIANGLES)]).write(tmp_path / "raw" / "a" / name)
+    if message:
+        with pytest.raises(ImportFailure, match=message):
+            imported(tmp_path, frame_dt=DT)
+    else:
+        assert imported(tmp_path, frame_dt=DT).num_frames == len(names.split())
+
+
 @pytest.mark.parametrize("refers", [False, True])
 def test_grids_of_xdmf_have_their_own_points(tmp_path: Path, refers: bool) -> None:
     """Or refer to those of the first grid."""
