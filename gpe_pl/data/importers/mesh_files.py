@@ -202,6 +202,20 @@ def times_of(path: Path) -> np.ndarray | None:
         return None
 
 
+def files_of(path: Path) -> list[Path]:
+    """Return the files that a PVD or XDMF file names; none if it cannot be read or is of another format."""
+    try:
+        if path.suffix.lower() == ".pvd":
+            return [file.resolve() for _, file in _collection(path)]
+        if path.suffix.lower() in XDMF:
+            with _readable(path):
+                items = [item for item in ElementTree.parse(path).iter("DataItem") if item.get("Format") in ("HDF", "Binary")]
+                return [(path.parent / (item.text or "").split(":")[0].strip()).resolve() for item in items]
+    except Refusal:
+        pass
+    return []
+
+
 @contextlib.contextmanager
 def _readable(path: Path) -> Iterator[None]:
     """Turn the various errors of readers, and their exits, into a refusal that names the file; what they print is dropped."""

@@ -6,7 +6,7 @@
 - ``NAME.xdmf`` or ``NAME.xmf`` with a series in time,
 - ``NAME.e``, ``NAME.ex2`` or ``NAME.exo``: Exodus with all times, which also needs the package netCDF4, or
 - a folder ``NAME/`` with one file per frame, of any format that meshio reads. Their names differ in one number, which gives their order. ``frame_dt`` has to be
-  given.
+  given. A folder with files that a PVD or XDMF file beside it lists is none.
 
 Arrays are found by their names. ``arrays={displacement: U, stress: S}`` names those that are called otherwise in the files:
 
@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl.data.importers.mesh_files import ENDINGS, Frame, read_series, times_of
+from gpe_pl.data.importers.mesh_files import ENDINGS, Frame, files_of, read_series, times_of
 from gpe_pl.data.importers.meshes import (
     add_to_nodes,
     between_frames,
@@ -91,19 +91,15 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         if role not in ROLES:
             raise ImportFailure(f"arrays.{role}: unknown{did_you_mean(role, ROLES)}; arrays are {', '.join(ROLES)}")
     folders, warnings = split_folders(path)
-    splits = {}
-    for split, folder in (folders or {"train": path}).items():
-        found = _trajectories(folder)
-        if found:
-            splits[split] = [Item(place.stem, partial(_load, place, settings)) for place in found]
+    found = {split: _trajectories(folder) for split, folder in (folders or {"train": path}).items()}
+    splits = {split: [Item(place.stem, partial(_load, place, settings)) for place in places] for split, places in found.items() if places}
     if not splits:
         wanted = ", ".join(f"*{ending}" for ending in ENDINGS)
         raise ImportFailure(
             f"{path}: {'no such folder' if not path.is_dir() else f'holds no {wanted} and no folders with a file per frame'}"
         )
     first = next(iter(splits.values()))[0].name
-    places = [place for folder in (folders.values() or [path]) for place in _trajectories(folder)]
-    times = next((t for place in places if (t := times_of(place)) is not None and len(t) > 1), None)
+    times = next((t for places in found.values() for place in places if (t := times_of(place)) is not None and len(t) > 1), None)
     facts = Facts(frame_dt=None if times is None else float(times[1] - times[0])).overridden(settings)
     if facts.frame_dt is None:
         raise ImportFailure(f"frame_dt: {first} has no times; pass frame_dt=… [s]")
@@ -111,12 +107,14 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
 
 
 def _trajectories(folder: Path) -> list[Path]:
-    """Return files and folders that are a trajectory each; a folder beside a file of its name belongs to that file."""
+    """Return files and folders that are a trajectory each. A folder belongs to a file if it has the file's name, or holds what the file lists."""
     if not folder.is_dir():
         return []
     files = [entry for entry in folder.iterdir() if entry.is_file() and entry.suffix.lower() in ENDINGS]
     named = {file.stem for file in files}
-    folders = [entry for entry in folder.iterdir() if entry.is_dir() and entry.name not in named and not entry.name.startswith(".")]
+    listed = {parent for file in files for own in files_of(file) for parent in own.parents}
+    folders = [entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")]
+    folders = [entry for entry in folders if entry.name not in named and entry.resolve() not in listed]
     return sorted([*files, *folders], key=lambda place: natural(place.name))
 
 

@@ -63,9 +63,9 @@ def write_folder(folder: Path, edit: Callable[[Any, int], Any] = lambda mesh, fr
         mesh.write(folder / "beam" / f"step_{frame}.vtu")
 
 
-def write_xdmf(folder: Path, power: float = 1.0) -> None:
+def write_xdmf(folder: Path, power: float = 1.0, data_format: str = "XML") -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    with meshio.xdmf.TimeSeriesWriter(folder / "beam.xdmf", data_format="XML") as writer:
+    with meshio.xdmf.TimeSeriesWriter(folder / "beam.xdmf", data_format=data_format) as writer:
         writer.write_points_cells(POINTS, [("hexahedron", CELLS)])
         for frame in range(FRAMES):
             points, cells = arrays(frame)
@@ -460,6 +460,35 @@ def test_several_parts_of_a_time_are_told(tmp_path: Path) -> None:
     (tmp_path / "raw" / "beam.pvd").write_text(f'<VTKFile type="Collection"><Collection>{entries}</Collection></VTKFile>')
     with pytest.raises(ImportFailure, match=r"beam.pvd lists 2 files for the time 0; join the parts of each time into one file"):
         imported(tmp_path)
+
+
+def write_collections(folder: Path, files: str) -> None:
+    """Write two collections of seven frames; ``files`` is the place of a frame, with the name and the number of the frame."""
+    for scale, name in ((1.0, "a"), (1.2, "b")):
+        entries = ""
+        for frame in range(FRAMES):
+            file = files.format(name=name, frame=frame)
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            meshio.Mesh(FLAT + scale * displacement(FLAT)[frame], [("triangle", TRIANGLES)]).write(folder / file)
+            entries += f'<DataSet timestep="{DT * frame}" file="{file}"/>'
+        (folder / f"{name}.pvd").write_text(f'<VTKFile type="Collection"><Collection>{entries}</Collection></VTKFile>')
+
+
+@pytest.mark.parametrize("files", ["vtu/{name}_{frame}.vtu", "vtu/{name}/{frame}.vtu", "vtu/{frame}{name}.vtu"])
+def test_a_folder_of_several_collections_is_no_trajectory(tmp_path: Path, files: str) -> None:
+    write_collections(tmp_path / "raw", files)
+    report = import_dataset(tmp_path / "data", ImportSettings("meshio", str(tmp_path / "raw"), "set", holdout=0.0))
+    assert not report.refusals and report.splits["train"].trajectories == 2
+
+
+def test_a_folder_with_the_values_of_an_xdmf_file_is_no_trajectory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "raw" / "values").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "raw" / "values")  # where meshio writes the values
+    write_xdmf(tmp_path / "raw", data_format="HDF")
+    text = (tmp_path / "raw" / "beam.xdmf").read_text()
+    (tmp_path / "raw" / "beam.xdmf").write_text(text.replace("beam.h5:", "values/beam.h5:"))
+    report = import_dataset(tmp_path / "data", ImportSettings("meshio", str(tmp_path / "raw"), "set", holdout=0.0, arrays={"stress": "S"}))
+    assert not report.refusals and report.splits["train"].trajectories == 1
 
 
 def test_a_collection_must_not_leave_its_folder(tmp_path: Path) -> None:
