@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.sparse import csr_array
 
 from gpe_pl.data.importers.source import Facts, Refusal
+from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.schema import CELL_KINDS
 
 SIMPLICES = {
@@ -25,10 +26,15 @@ UNEVEN = 1e-3
 """Frames are evenly spaced if their intervals differ by less than this fraction."""
 
 
-def sizes(rest_pos: Float[np.ndarray, "node dim"], kind: str, cells: np.ndarray) -> Float[np.ndarray, "cell"]:
-    """Return the lengths [m], areas [m²] or volumes [m³] of cells [cell, corner] of one kind."""
+def sizes(
+    rest_pos: Float[np.ndarray, "node dim"], kind: str, cells: np.ndarray, periodicity: Periodicity = NOWHERE
+) -> Float[np.ndarray, "cell"]:
+    """Return the lengths [m], areas [m²] or volumes [m³] of cells [cell, corner] of one kind.
+
+    Cells over the seam of a periodic domain have their shortest edges, so cells have to be shorter than half the period.
+    """
     corners = rest_pos[cells]
-    edges = [corners[:, s[1:]] - corners[:, s[:1]] for s in np.array(SIMPLICES[kind])]
+    edges = [periodicity.shortest(corners[:, s[1:]] - corners[:, s[:1]]) for s in np.array(SIMPLICES[kind])]
     gram = np.array([np.linalg.det(e @ e.swapaxes(1, 2)) for e in edges])
     return np.asarray(np.sqrt(np.maximum(gram, 0.0)).sum(axis=0) / math.factorial(edges[0].shape[1]))
 
@@ -69,7 +75,9 @@ def _corners(cells: np.ndarray, num_nodes: int) -> csr_array:
     return found
 
 
-def mean_at_nodes(rest_pos: np.ndarray, cells: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray]) -> np.ndarray:
+def mean_at_nodes(
+    rest_pos: np.ndarray, cells: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray], periodicity: Periodicity = NOWHERE
+) -> np.ndarray:
     """Return the mean [node, …] of the values of the cells around each node, weighted by the sizes of the cells; 0 at nodes without a cell.
 
     At each node only the cells of the highest dimension there count.
@@ -78,6 +86,7 @@ def mean_at_nodes(rest_pos: np.ndarray, cells: Mapping[str, np.ndarray], values:
         rest_pos: positions at rest [node, dim] in m.
         cells: nodes of the cells by kind [cell, corner].
         values: values of the cells by kind [cell, …].
+        periodicity: periodic axes of the domain.
     """
     shape = next(iter(values.values())).shape[1:]
     total, weight = np.zeros((len(rest_pos), *shape)), np.zeros(len(rest_pos))
@@ -85,7 +94,7 @@ def mean_at_nodes(rest_pos: np.ndarray, cells: Mapping[str, np.ndarray], values:
     while left:
         highest, without = of_highest_dimension(left), weight == 0
         for kind, own in highest.items():
-            size = sizes(rest_pos, kind, own)
+            size = sizes(rest_pos, kind, own, periodicity)
             here = without[own] * size[:, None]
             weighted = here.reshape(*own.shape, *[1] * len(shape)) * values[kind][:, None]
             weighted[here == 0] = 0.0  # also where cells that do not count have no value

@@ -58,11 +58,13 @@ from gpe_pl.data.importers.source import (
     Refusal,
     Source,
     build,
+    check_axes,
     natural,
     split_folders,
     typed,
 )
 from gpe_pl.errors.printable import did_you_mean
+from gpe_pl.geometry.periodicity import Periodicity
 from gpe_pl.schema import BOUNDARY, CELL_KINDS, MATERIALS
 
 PARAMETERS = tuple(dict.fromkeys(p.name for own in MATERIALS.values() for p in own))
@@ -125,10 +127,11 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
     if frames[0].time is not None:
         check_intervals(np.array([frame.time for frame in frames], float), facts, "write results at even intervals")
     frames = in_one_order(frames)
-    arrays = _Arrays(frames, settings.arrays or {})
+    arrays = _Arrays(frames, settings.arrays or {}, facts.periodicity)
     pos, rest = _positions(frames, arrays)
     planar = not pos[..., 2:].any() and not rest[..., 2:].any() and not {"tetrahedron", "wedge", "hexahedron"} & {*frames[0].cells}
     dim = 2 if planar else 3
+    check_axes(facts, dim)
     pos, rest, cells = pos[..., :dim], rest[..., :dim], without_faces(frames[0].cells, pos.shape[1])
     number = arrays.of_points("material")
     types = np.zeros(pos.shape[1], int) if number is None else np.rint(number[0].reshape(pos.shape[1])).astype(int)
@@ -190,7 +193,7 @@ def _vectors(arrays: _Arrays, role: str, dim: int) -> np.ndarray | None:
 
 
 def _add_masses(nodes: Nodes, arrays: _Arrays, rest: np.ndarray, cells: Mapping[str, np.ndarray]) -> None:
-    mass, density = arrays.of_points("mass"), arrays.in_cells("density", cells)
+    mass, density = arrays.of_points("mass"), arrays.in_cells("density", rest, cells)
     if mass is not None:
         nodes.mass = mass[0].reshape(-1)
     elif density is not None and cells:
@@ -202,7 +205,7 @@ def _add_masses(nodes: Nodes, arrays: _Arrays, rest: np.ndarray, cells: Mapping[
                 f"known; give masses of points as {arrays.name('mass')!r}"
             )
         for kind, rows in filling.items():
-            add_to_nodes(total, rows, density[kind] * sizes(rest, kind, rows) / rows.shape[1])
+            add_to_nodes(total, rows, density[kind] * sizes(rest, kind, rows, arrays.periodicity) / rows.shape[1])
         if (total == 0).any():
             raise Refusal(
                 f"point {int((total == 0).argmax())} belongs to no cell of {has} dimensions, so it has no mass; leave it out or give {arrays.name('mass')!r}"
@@ -220,10 +223,11 @@ class _Arrays:
     Args:
         frames: the frames.
         names: names in the files by role, where they differ.
+        periodicity: periodic axes of the domain, over whose seam cells may go.
     """
 
-    def __init__(self, frames: list[Frame], names: Mapping[str, str]) -> None:
-        self.frames, self.names = frames, names
+    def __init__(self, frames: list[Frame], names: Mapping[str, str], periodicity: Periodicity) -> None:
+        self.frames, self.names, self.periodicity = frames, names, periodicity
 
     def name(self, role: str) -> str:
         """Return the name of an array in the files."""
@@ -254,12 +258,12 @@ class _Arrays:
         for frame in self.frames:
             values = frame.cell_data.get(name)
             whole = values is not None and {*values} >= {*frame.cells}
-            found.append(mean_at_nodes(rest, frame.cells, values) if whole and values is not None else None)
+            found.append(mean_at_nodes(rest, frame.cells, values, self.periodicity) if whole and values is not None else None)
             if found[-1] is not None and np.isnan(found[-1]).any():
                 raise Refusal(f"{frame.file} has no {name!r} in some of its cells; write it in all blocks of cells")
         return self._stacked(role, found)
 
-    def in_cells(self, role: str, cells: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
+    def in_cells(self, role: str, rest: np.ndarray, cells: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
         """Return values of the cells of the highest dimension in the first frame by kind [cell], or the means of the values of their corners; None if there are
         none. Means over the cells around nodes would be wrong where values jump.
         """
@@ -269,7 +273,7 @@ class _Arrays:
             return {kind: of_points[0].reshape(-1)[rows].mean(axis=1) for kind, rows in of_highest_dimension(cells).items()}
         if name not in first.cell_data:
             return None
-        self.at_points(role, first.points)  # refuses frames without it
+        self.at_points(role, rest)  # refuses frames without it
         return {kind: np.asarray(first.cell_data[name][kind], np.float64).reshape(-1) for kind in of_highest_dimension(cells)}
 
     def _stacked(self, role: str, found: list[Any]) -> np.ndarray | None:

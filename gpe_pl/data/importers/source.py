@@ -277,9 +277,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
     """
     if facts.frame_dt is None:
         raise ImportFailure("frame_dt: the source does not say how much time passes between frames; pass frame_dt=… [s]")
-    for name, axes in (("bounds", facts.bounds), ("periodic", facts.periodic)):
-        if axes is not None and len(axes) != nodes.pos.shape[2]:
-            raise Refusal(f"{name} = {axes}: has {len(axes)} axes, the data have {nodes.pos.shape[2]}")
+    check_axes(facts, nodes.pos.shape[2])
     numbers("pos", nodes.pos, {"frame": None, "node": None, "dim": None})
     moving = np.flatnonzero(nodes.kind != BOUNDARY)
     if not len(moving):
@@ -339,6 +337,13 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
         assumes_gravity,
         nodes.types,
     )
+
+
+def check_axes(facts: Facts, dim: int) -> None:
+    """Raise ``Refusal`` if bounds or periodic axes are not those of ``dim`` axes."""
+    for name, axes in (("bounds", facts.bounds), ("periodic", facts.periodic)):
+        if axes is not None and len(axes) != dim:
+            raise Refusal(f"{name} = {axes}: has {len(axes)} axes, the data have {dim}")
 
 
 def _wider_than_periods(first: np.ndarray, periodicity: Periodicity) -> Iterator[str]:

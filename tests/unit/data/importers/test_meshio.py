@@ -257,6 +257,28 @@ def test_nodes_without_a_solid_have_the_mean_of_their_other_cells() -> None:
     assert found.tolist() == [2.0, 2.0, 2.0, 5.0]
 
 
+def test_cells_over_the_seam_of_a_periodic_domain_have_their_own_size(tmp_path: Path) -> None:
+    """Also as weights of what cells have: a cell over the seam, of stress 3, is twice as wide as the others, of stress 0."""
+    points = np.array([[x, y, 0.0] for x in (0.0, 0.2, 0.4, 0.6) for y in (0.0, 0.1)])
+    cells = np.array([[2 * k, (2 * k + 2) % 8, (2 * k + 3) % 8, 2 * k + 1] for k in range(4)])
+    (tmp_path / "raw" / "a").mkdir(parents=True)
+    for frame in range(FRAMES):
+        moved = 0.01 * np.sin(40 * DT * frame) * np.array([0.0, 1.0, 0.0]) * np.sin(2 * np.pi * points[:, :1])
+        data = {"density": [np.full(4, DENSITY)], "stress": [np.repeat([[0.0], [0.0], [0.0], [3.0]], 6, axis=1)]}
+        mesh = meshio.Mesh(points, [("quad", cells)], point_data={"displacement": moved}, cell_data=data)
+        mesh.write(tmp_path / "raw" / "a" / f"{frame}.vtu")
+    bounds = [(0.0, 1.0), (-1.0, 1.0)]
+    found = imported(tmp_path, frame_dt=DT, periodic=[True, False], bounds=bounds)
+    np.testing.assert_allclose(found.mass, DENSITY * 0.1 * np.repeat([0.6, 0.4, 0.4, 0.6], 2) / 4, rtol=1e-5)
+    assert found.stress is not None
+    np.testing.assert_allclose(found.stress.node[:, :, 0], np.tile(np.repeat([2.0, 0.0, 0.0, 2.0], 2), (FRAMES, 1)), atol=1e-6)
+    with pytest.raises(ImportFailure, match=r"bounds = .* has 3 axes, the data have 2"):
+        import_dataset(
+            tmp_path / "data",
+            ImportSettings("meshio", str(tmp_path / "raw"), "b", frame_dt=DT, bounds=[*bounds, (0.0, 1.0)], periodic=[True] * 3),
+        )
+
+
 def test_masses_jump_where_the_density_of_cells_does(tmp_path: Path) -> None:
     def edit(mesh: Any, frame: int) -> Any:
         mesh.cell_data["density"] = [np.array([DENSITY, 5 * DENSITY])]
