@@ -14,13 +14,14 @@ Arrays are found by their names. ``arrays={displacement: U, stress: S}`` names t
   are positions, and displacements lead back to the undeformed positions. Without displacements, points that move are positions.
 - ``velocity`` of points [point, axis] in m/s. Without it, velocities are differences of positions.
 - ``stress`` of points or cells: 6 components in VTK's order XX, YY, ZZ, XY, YZ, XZ, or 9. The stress of a cell goes to its nodes, as the mean by size of cells.
-- ``prescribed`` of points: not 0 where the motion is given, or [point, axis] along which axes it is, as in the first frame.
+- ``prescribed`` of points: not 0 where the motion is given, or [point, axis] along which axes it is.
 - ``force`` of points [point, axis] in N at the times of the frames. From a frame to the next, the mean of both acts.
-- ``mass`` of points [kg], or ``density`` of points or cells [kg/m³] (in 2D kg/m²), with which cells of the highest dimension count. Otherwise all masses are
-  1 kg, which does not suit forces.
+- ``mass`` of points [kg], or ``density`` of points or cells [kg/m³] (in 2D kg/m²) in the first frame, with which cells of the highest dimension count.
+  Otherwise all masses are 1 kg, which does not suit forces.
 - ``material`` of points: numbers, which ``materials={1: elastomer}`` names. Without it, all have number 0, which is ``solid`` for meshes.
 - Parameters of materials at points or in cells, such as ``youngs_modulus`` and ``poisson_ratio``.
 
+``prescribed``, ``mass``, ``material`` and parameters are the same in all frames; a series in which they change is refused.
 Points keep their rows in all frames. Where rows change, numbers of points such as ``id`` or ``GlobalNodeId`` say which is which, see ``same_mesh``.
 
 Scenes whose points all have the third coordinate 0 are two-dimensional. Cells are lines, triangles, quadrilaterals, tetrahedra, wedges and hexahedra; others
@@ -78,6 +79,9 @@ COMPONENTS = {
 }
 """Columns of a stress of 6 or 9 components in the order of ``schema.STRESS_COMPONENTS``, by dimension of space and number of components."""
 
+ROUNDING = 1e-5
+"""Values of two frames are the same if they differ by less than this fraction, because files store rounded numbers."""
+
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
     """Return the computations at ``path``.
@@ -133,19 +137,14 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
     dim = 2 if planar else 3
     check_axes(facts, dim)
     pos, rest, cells = pos[..., :dim], rest[..., :dim], without_faces(frames[0].cells, pos.shape[1])
-    number = arrays.of_points("material")
-    types = np.zeros(pos.shape[1], int) if number is None else np.rint(number[0].reshape(pos.shape[1])).astype(int)
-    nodes = typed(pos, types, {0: "solid"} if cells else {}, settings, cells=cells or None, rest_pos=rest)
+    nodes = typed(pos, _types(arrays, pos.shape[1]), {0: "solid"} if cells else {}, settings, cells=cells or None, rest_pos=rest)
     for kind, corners in frames[0].cells.items():
         if len(cells.get(kind, ())) < len(corners):
             nodes.notes.append(f"cells of kind {kind} whose corners all belong to one other cell of a higher dimension are left out")
     nodes.vel = _vectors(arrays, "velocity", dim)
     force = _vectors(arrays, "force", dim)
     nodes.force = None if force is None else between_frames(force)
-    prescribed = arrays.of_points("prescribed")
-    if prescribed is not None and prescribed[0].any():
-        per_axis = prescribed[0].reshape(pos.shape[1], -1) != 0
-        nodes.prescribed = per_axis[:, :dim] if per_axis.shape[1] > 1 else per_axis[:, 0]
+    nodes.prescribed = _prescribed(arrays, dim)
     stress = arrays.at_points("stress", rest)
     if stress is not None:
         stress = stress.reshape(*stress.shape[:2], -1)
@@ -154,10 +153,31 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
         nodes.stress = stress[..., COMPONENTS[dim, stress.shape[2]]]
     _add_masses(nodes, arrays, rest, cells)
     for material in {*nodes.kind.tolist()} - {BOUNDARY}:
-        own = {p.name: v[0].reshape(-1) for p in MATERIALS[material] if (v := arrays.at_points(p.name, rest)) is not None}
+        values = {p.name: arrays.constant(p.name, arrays.at_points(p.name, rest)) for p in MATERIALS[material]}
+        own = {name: value.reshape(-1) for name, value in values.items() if value is not None}
         if own:
             nodes.parameters = {**nodes.parameters, material: own}
     return build(nodes, facts)
+
+
+def _types(arrays: _Arrays, num_nodes: int) -> np.ndarray:
+    """Return the number of the material of each point [point]; 0 without such numbers."""
+    numbers = arrays.constant("material", arrays.of_points("material"))
+    if numbers is None:
+        return np.zeros(num_nodes, int)
+    return np.rint(numbers.reshape(num_nodes)).astype(int)
+
+
+def _prescribed(arrays: _Arrays, dim: int) -> np.ndarray | None:
+    """Return of which points the motion is given [point], or along which axes it is [point, dim]; None if it is of none."""
+    values = arrays.of_points("prescribed")
+    if values is None:
+        return None
+    given = arrays.constant("prescribed", values != 0)
+    if given is None or not given.any():
+        return None
+    per_axis = given.reshape(len(given), -1)
+    return per_axis[:, :dim] if per_axis.shape[1] > 1 else per_axis[:, 0]
 
 
 def _positions(frames: list[Frame], arrays: _Arrays) -> tuple[np.ndarray, np.ndarray]:
@@ -193,9 +213,9 @@ def _vectors(arrays: _Arrays, role: str, dim: int) -> np.ndarray | None:
 
 
 def _add_masses(nodes: Nodes, arrays: _Arrays, rest: np.ndarray, cells: Mapping[str, np.ndarray]) -> None:
-    mass, density = arrays.of_points("mass"), arrays.in_cells("density", rest, cells)
+    mass, density = arrays.constant("mass", arrays.of_points("mass")), arrays.in_cells("density", rest, cells)
     if mass is not None:
-        nodes.mass = mass[0].reshape(-1)
+        nodes.mass = mass.reshape(-1)
     elif density is not None and cells:
         total, filling = np.zeros(len(rest)), of_highest_dimension(cells)
         kind = next(iter(filling))
@@ -262,6 +282,23 @@ class _Arrays:
             if found[-1] is not None and np.isnan(found[-1]).any():
                 raise Refusal(f"{frame.file} has no {name!r} in some of its cells; write it in all blocks of cells")
         return self._stacked(role, found)
+
+    def constant(self, role: str, values: np.ndarray | None) -> np.ndarray | None:
+        """Return values [frame, point, …] of the first frame; None if there are none.
+
+        Raises:
+            Refusal: those of a later frame differ by more than rounding.
+        """
+        if values is None:
+            return None
+        for k, (frame, own) in enumerate(zip(self.frames, values, strict=True)):
+            if not np.allclose(own, values[0], rtol=ROUNDING, atol=0.0, equal_nan=True):
+                raise Refusal(
+                    f"{frame.file}: array {self.name(role)!r} differs from {self.frames[0].file}; it changes with time, and a trajectory has one value of "
+                    "it per node. Give it the values that hold throughout, or give only the frames in which it does not change",
+                    k,
+                )
+        return np.asarray(values[0])
 
     def in_cells(self, role: str, rest: np.ndarray, cells: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
         """Return values of the cells of the highest dimension in the first frame by kind [cell], or the means of the values of their corners; None if there are

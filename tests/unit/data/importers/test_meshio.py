@@ -549,6 +549,49 @@ def test_particles_whose_rows_change_are_followed(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.pos - found.pos[0], displacement(FLAT)[:, order, :2], atol=1e-6)
 
 
+def changing(name: str, values: Callable[[int], np.ndarray], places: str = "points") -> Callable[[Any, int], Any]:
+    """Return an edit that gives points or cells other values in each frame."""
+
+    def edit(mesh: Any, frame: int) -> Any:
+        if places == "points":
+            mesh.cell_data.pop(name, None)
+            mesh.point_data[name] = values(frame)
+        else:
+            mesh.cell_data[name] = [values(frame)]
+        return mesh
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (changing("prescribed", lambda k: (POINTS[:, 0] == 0) * float(k > 2)), "step_3.vtu: array 'prescribed' differs from step_0.vtu; it changes with time"),
+        (changing("prescribed", lambda k: (POINTS[:, 0] == 0) * float(k < 2)), "step_2.vtu: array 'prescribed' differs from step_0.vtu"),
+        (changing("mass", lambda k: np.full(12, 1.0 / (1 + k))), "step_1.vtu: array 'mass' differs from step_0.vtu.* a trajectory has one value of it"),
+        (changing("material", lambda k: np.full(12, k // 4)), "step_4.vtu: array 'material' differs from step_0.vtu"),
+        (changing("youngs_modulus", lambda k: np.full(12, 1e5 + k)), "step_2.vtu: array 'youngs_modulus' differs from step_0.vtu"),
+        (changing("youngs_modulus", lambda k: np.array([1e5, 1e5 + 9 * k]), "cells"), "step_1.vtu: array 'youngs_modulus' differs from step_0.vtu"),
+    ],
+)  # fmt: skip
+def test_what_changes_with_time_but_is_stored_once_is_refused(tmp_path: Path, edit: Callable[[Any, int], Any], message: str) -> None:
+    write_folder(tmp_path / "raw", edit)
+    with pytest.raises(ImportFailure, match=message):
+        imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
+
+
+def test_rounding_and_the_size_of_marks_are_no_change(tmp_path: Path) -> None:
+    def edit(mesh: Any, frame: int) -> Any:
+        mesh.point_data["prescribed"] = (POINTS[:, 0] == 0) * (1.0 + frame)
+        mesh.point_data["mass"] = np.full(12, 2.0 + 1e-6 * frame)
+        return mesh
+
+    write_folder(tmp_path / "raw", edit)
+    found = imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
+    assert found.prescribed is not None and found.prescribed.any(axis=1).sum() == 4
+    np.testing.assert_allclose(found.mass, 2.0)
+
+
 def numbered(numbers: Callable[[int], np.ndarray | None]) -> Callable[[Any, int], Any]:
     """Return an edit that adds numbers of points, by frame."""
 
