@@ -82,6 +82,9 @@ COMPONENTS = {
 ROUNDING = 1e-5
 """Values of two frames are the same if they differ by less than this fraction, because files store rounded numbers."""
 
+WHOLE = 1e-3
+"""Numbers of materials are whole within this margin."""
+
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
     """Return the computations at ``path``.
@@ -165,7 +168,16 @@ def _types(arrays: _Arrays, num_nodes: int) -> np.ndarray:
     numbers = arrays.constant("material", arrays.of_points("material"))
     if numbers is None:
         return np.zeros(num_nodes, int)
-    return np.rint(numbers.reshape(num_nodes)).astype(int)
+    numbers = numbers.reshape(num_nodes)
+    found = np.rint(numbers)
+    wrong = ~(np.abs(numbers - found) <= WHOLE)  # also NaN
+    if wrong.any():
+        node = int(wrong.argmax())
+        file, name = arrays.frames[0].file, arrays.name("material")
+        raise Refusal(
+            f"{file}: array {name!r} is {numbers[node]:g} at node {node}; numbers of materials are whole, also at the border of two"
+        )
+    return found.astype(int)
 
 
 def _prescribed(arrays: _Arrays, dim: int) -> np.ndarray | None:

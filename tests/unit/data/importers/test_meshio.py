@@ -580,6 +580,20 @@ def test_what_changes_with_time_but_is_stored_once_is_refused(tmp_path: Path, ed
         imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
 
 
+@pytest.mark.parametrize("value", [1.5, 1.01, np.nan])
+def test_numbers_of_materials_are_whole(tmp_path: Path, value: float) -> None:
+    numbers = np.where(POINTS[:, 0] > 0, 1.0, 2.0)
+    numbers[5] = value
+    write_folder(tmp_path / "raw", changing("M", lambda k: numbers))
+    with pytest.raises(ImportFailure, match=f"step_0.vtu: array 'M' is {value:g} at node 5; numbers of materials are whole"):
+        imported(tmp_path, arrays={"stress": "S", "material": "M"}, frame_dt=DT, materials={1: "solid", 2: "elastomer"})
+
+
+def test_numbers_of_materials_may_be_rounded(tmp_path: Path) -> None:
+    write_folder(tmp_path / "raw", changing("material", lambda k: np.full(12, 0.9999)))
+    assert imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT, materials={1: "elastomer"}).metadata.materials == ("elastomer",)
+
+
 def test_rounding_and_the_size_of_marks_are_no_change(tmp_path: Path) -> None:
     def edit(mesh: Any, frame: int) -> Any:
         mesh.point_data["prescribed"] = (POINTS[:, 0] == 0) * (1.0 + frame)
