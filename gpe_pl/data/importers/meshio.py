@@ -185,6 +185,10 @@ def _prescribed(arrays: _Arrays, dim: int) -> np.ndarray | None:
     values = arrays.of_points("prescribed")
     if values is None:
         return None
+    if np.isnan(values).any():
+        frame, node, *_ = np.argwhere(np.isnan(values))[0].tolist()
+        file, name = arrays.frames[frame].file, arrays.name("prescribed")
+        raise Refusal(f"{file}: array {name!r} is NaN at node {node}; write 0 where the motion is free", frame)
     given = arrays.constant("prescribed", values != 0)
     if given is None or not given.any():
         return None

@@ -580,6 +580,14 @@ def test_what_changes_with_time_but_is_stored_once_is_refused(tmp_path: Path, ed
         imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
 
 
+def test_a_mark_without_a_value_is_refused(tmp_path: Path) -> None:
+    """Not taken for a clamp."""
+    marks = np.where(POINTS[:, 0] > 0, np.nan, 1.0)
+    write_folder(tmp_path / "raw", changing("prescribed", lambda k: marks))
+    with pytest.raises(ImportFailure, match="step_0.vtu: array 'prescribed' is NaN at node 4; write 0 where the motion is free"):
+        imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
+
+
 @pytest.mark.parametrize("value", [1.5, 1.01, np.nan])
 def test_numbers_of_materials_are_whole(tmp_path: Path, value: float) -> None:
     numbers = np.where(POINTS[:, 0] > 0, 1.0, 2.0)
