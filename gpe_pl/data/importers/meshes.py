@@ -109,6 +109,12 @@ def between_frames(force: Float[np.ndarray, "frame node dim"]) -> Float[np.ndarr
     return (force + np.concatenate([force[1:], force[-1:]])) / 2
 
 
+def interval(times: np.ndarray) -> float:
+    """Return the time between frames [s] at ``times`` [frame] in s: the mean of intervals that are even but for rounding, otherwise the first one."""
+    steps = np.diff(times)
+    return float(steps.mean() if _are_even(steps) else steps[0])
+
+
 def check_intervals(times: np.ndarray, facts: Facts, advice: str) -> None:
     """Check that frames are ``facts.frame_dt`` apart, or evenly spaced if that is None.
 
@@ -121,10 +127,15 @@ def check_intervals(times: np.ndarray, facts: Facts, advice: str) -> None:
         Refusal: intervals differ.
     """
     steps = np.diff(times)
-    expected = facts.frame_dt or steps[0]
-    if steps.min() <= 0 or np.ptp(steps) > UNEVEN * steps[0] or abs(steps[0] / expected - 1) > UNEVEN:
-        if facts.frame_dt and steps.min() > 0 and np.ptp(steps) <= UNEVEN * steps[0]:
-            raise Refusal(
-                f"results are {steps[0]:g} s apart, and frame_dt is {facts.frame_dt:g} s (of the command, or of other trajectories); both must be the same"
-            )
+    step = interval(times)
+    expected = facts.frame_dt or step
+    if not _are_even(steps):
         raise Refusal(f"intervals between results are {steps.min():g} to {steps.max():g} s, expected {expected:g} s; {advice}")
+    if abs(step / expected - 1) > UNEVEN:
+        raise Refusal(
+            f"results are {step:g} s apart, and frame_dt is {expected:g} s (of the command, or of other trajectories); both must be the same"
+        )
+
+
+def _are_even(steps: np.ndarray) -> bool:
+    return bool(steps.min() > 0 and np.ptp(steps) <= UNEVEN * steps[0])

@@ -43,6 +43,7 @@ from gpe_pl.data.importers.meshes import (
     add_to_nodes,
     between_frames,
     check_intervals,
+    interval,
     mean_at_nodes,
     of_highest_dimension,
     sizes,
@@ -109,7 +110,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         )
     first = next(iter(splits.values()))[0].name
     times = next((t for places in found.values() for place in places if (t := times_of(place)) is not None and len(t) > 1), None)
-    facts = Facts(frame_dt=None if times is None else float(times[1] - times[0])).overridden(settings)
+    facts = Facts(frame_dt=None if times is None else interval(times)).overridden(settings)
     if facts.frame_dt is None:
         raise ImportFailure(f"frame_dt: {first} has no times; pass frame_dt=… [s]")
     return Source(facts, splits, warnings)

@@ -457,6 +457,15 @@ def test_what_cannot_be_used_is_refused_by_file_and_array(tmp_path: Path, edit: 
         imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
 
 
+def test_the_interval_is_the_mean_of_rounded_times(tmp_path: Path) -> None:
+    (tmp_path / "raw").mkdir()
+    with meshio.xdmf.TimeSeriesWriter(tmp_path / "raw" / "a.xdmf", data_format="XML") as writer:
+        writer.write_points_cells(FLAT, [("triangle", TRIANGLES)])
+        for frame in range(FRAMES):
+            writer.write_data(round(frame / 30, 5), point_data={"displacement": displacement(FLAT)[frame]})
+    assert imported(tmp_path).metadata.frame_dt == pytest.approx(1 / 30, rel=1e-6)
+
+
 def test_a_damaged_file_uneven_times_and_wrong_settings_are_named(tmp_path: Path) -> None:
     write_folder(tmp_path / "raw")
     (tmp_path / "raw" / "beam" / "step_3.vtu").write_text("<VTKFile")
