@@ -48,8 +48,6 @@ WHOLE = 1e-6
 """Multiples of the usual step between numbers are whole within this margin."""
 COMPONENTS = (("xx", "yy", "zz", "xy", "yz", "xz"), ("xx", "yy", "zz", "xy", "yz", "zx"), ("x", "y", "z"), ("x", "y"))
 """Endings of the names of the components of tensors, in VTK's order, and of vectors."""
-WEDGE = [0, 2, 1, 3, 5, 4]
-"""Corners of a wedge in VTK's order, from the other orientation."""
 
 
 @dataclass
@@ -97,17 +95,8 @@ class Frame:
                 raise Refusal(
                     f"{file} has cells of kind {kind} with points {corners.min()} to {corners.max()}; there are {len(points)} points"
                 )
-        if "wedge" in whole:
-            whole["wedge"] = _outward(points, whole["wedge"])
         cell_data = {name: {kind: np.concatenate(parts) for kind, parts in own.items()} for name, own in data.items()}
         return cls(file, time, points, whole, {name: np.asarray(values) for name, values in mesh.point_data.items()}, cell_data)
-
-
-def _outward(points: np.ndarray, wedges: np.ndarray) -> np.ndarray:
-    """Return wedges in VTK's order: seen from outside, the corners of the first triangle run counter-clockwise. Formats differ in this."""
-    corners = points[wedges]
-    volume = np.linalg.det(corners[:, 1:4] - corners[:, :1])
-    return np.where((volume > 0)[:, None], wedges[:, WEDGE], wedges)
 
 
 def read_series(path: Path) -> list[Frame]:

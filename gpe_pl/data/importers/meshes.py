@@ -1,4 +1,4 @@
-"""What importers of finite-element computations share: sizes of cells, masses and means at nodes, and frames at even intervals."""
+"""What importers of finite-element computations share: sizes and orientation of cells, masses and means at nodes, and frames at even intervals."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ SIMPLICES = {
     "hexahedron": [[0, 1, 3, 4], [1, 2, 3, 6], [1, 3, 4, 6], [1, 4, 5, 6], [3, 4, 6, 7]],
 }
 """Simplices that fill each kind of cell."""
+WEDGE = [0, 2, 1, 3, 5, 4]
+"""Corners of a wedge in VTK's order, from the other orientation."""
 UNEVEN = 1e-3
 """Frames are evenly spaced if their intervals differ by less than this fraction."""
 
@@ -37,6 +39,13 @@ def sizes(
     edges = [periodicity.shortest(corners[:, s[1:]] - corners[:, s[:1]]) for s in np.array(SIMPLICES[kind])]
     gram = np.array([np.linalg.det(e @ e.swapaxes(1, 2)) for e in edges])
     return np.asarray(np.sqrt(np.maximum(gram, 0.0)).sum(axis=0) / math.factorial(edges[0].shape[1]))
+
+
+def outward(rest_pos: Float[np.ndarray, "node 3"], wedges: np.ndarray, periodicity: Periodicity) -> np.ndarray:
+    """Return wedges [cell, 6] in VTK's order: seen from outside, the corners of the first triangle run counter-clockwise. Formats differ in this."""
+    corners = rest_pos[wedges]
+    volume = np.linalg.det(periodicity.shortest(corners[:, 1:4] - corners[:, :1]))
+    return np.where((volume > 0)[:, None], wedges[:, WEDGE], wedges)
 
 
 def add_to_nodes(total: np.ndarray, cells: np.ndarray, values: np.ndarray) -> None:

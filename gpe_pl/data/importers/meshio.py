@@ -46,6 +46,7 @@ from gpe_pl.data.importers.meshes import (
     interval,
     mean_at_nodes,
     of_highest_dimension,
+    outward,
     sizes,
     without_faces,
 )
@@ -141,6 +142,8 @@ def _load(path: Path, settings: ImportSettings, facts: Facts) -> Loaded:
     dim = 2 if planar else 3
     check_axes(facts, dim)
     pos, rest, cells = pos[..., :dim], rest[..., :dim], without_faces(frames[0].cells, pos.shape[1])
+    if "wedge" in cells:
+        cells["wedge"] = outward(rest, cells["wedge"], facts.periodicity)
     nodes = typed(pos, _types(arrays, pos.shape[1]), {0: "solid"} if cells else {}, settings, cells=cells or None, rest_pos=rest)
     for kind, corners in frames[0].cells.items():
         if len(cells.get(kind, ())) < len(corners):

@@ -279,6 +279,19 @@ def test_cells_over_the_seam_of_a_periodic_domain_have_their_own_size(tmp_path: 
         )
 
 
+def test_wedges_over_the_seam_keep_their_orientation(tmp_path: Path) -> None:
+    points = np.array([[x, y, z] for x in (0.0, 0.25, 0.5, 0.75) for y, z in ((0.0, 0.0), (0.0, 0.1), (0.1, 0.0))])
+    cells = (np.arange(6) + 3 * np.arange(4)[:, None]) % 12
+    (tmp_path / "raw" / "a").mkdir(parents=True)
+    for frame in range(FRAMES):
+        moved = 0.01 * np.sin(40 * DT * frame) * np.array([0.0, 1.0, 0.0]) * np.sin(2 * np.pi * points[:, :1])
+        meshio.Mesh(points, [("wedge", cells)], point_data={"displacement": moved}).write(tmp_path / "raw" / "a" / f"{frame}.vtu")
+    found = imported(tmp_path, frame_dt=DT, periodic=[True, False, False], bounds=[(0.0, 1.0), (-1.0, 1.0), (-1.0, 1.0)])
+    assert found.cells is not None
+    turned = [(row - row[0]) % 12 for row in found.cells]
+    np.testing.assert_array_equal(turned, np.repeat(turned[:1], 4, axis=0))
+
+
 def test_masses_jump_where_the_density_of_cells_does(tmp_path: Path) -> None:
     def edit(mesh: Any, frame: int) -> Any:
         mesh.cell_data["density"] = [np.array([DENSITY, 5 * DENSITY])]
