@@ -142,21 +142,28 @@ def _in_order(files: list[Path]) -> list[Path]:
 
 
 def _numbers(files: list[Path]) -> list[Decimal]:
-    """Return the number in which the names of the files of one series differ.
+    """Return the number in which the names of the files of one series differ; of several, such as step and time, the first that always rises.
 
     Raises:
-        Refusal: names differ elsewhere, so the files may be of several series.
+        Refusal: names differ elsewhere, or a number falls, so the files may be of several series.
     """
     parts = [DECIMAL.split(file.name) for file in files]
-    counting = max((k for k in range(1, min(map(len, parts)), 2) if len({own[k] for own in parts}) > 1), default=1)
-    around = [own[:counting] + own[counting + 1 :] for own in parts]
-    for file, own in zip(files, around, strict=True):
-        if own != around[0]:
-            raise Refusal(
-                f"{files[0].name} and {file.name}: names of the frames of a series differ in one number only; give each series a folder of its own, without "
-                "other files"
-            )
-    return [Decimal(own[counting]) for own in parts]
+    for file, own in zip(files, parts, strict=True):
+        if own[::2] != parts[0][::2]:
+            raise _several_series(files[0], file)
+    columns = [[Decimal(number) for number in column] for column in list(zip(*parts, strict=True))[1::2]]
+    varying = [column for column in columns if len({*column}) > 1] or [[Decimal(0)] * len(files)]
+    for column in varying if len(varying) > 1 else ():
+        if (fallen := next((k for k, (before, after) in enumerate(pairwise(column), 1) if after < before), None)) is not None:
+            raise _several_series(files[0], files[fallen])
+    return next((column for column in varying if all(before < after for before, after in pairwise(column))), varying[-1])
+
+
+def _several_series(first: Path, other: Path) -> Refusal:
+    return Refusal(
+        f"{first.name} and {other.name}: names of the frames of a series differ in numbers only, which rise together; give each series a folder of its own, "
+        "without other files"
+    )
 
 
 def _require_all_numbers(files: list[Path], numbers: list[Decimal]) -> None:

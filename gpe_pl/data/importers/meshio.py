@@ -5,8 +5,8 @@
 - ``NAME.pvd`` with the VTU files that it lists, as ParaView writes them,
 - ``NAME.xdmf`` or ``NAME.xmf`` with a series in time,
 - ``NAME.e``, ``NAME.ex2`` or ``NAME.exo``: Exodus with all times, which also needs the package netCDF4, or
-- a folder ``NAME/`` with one file per frame, of any format that meshio reads. Their names differ in one number, which gives their order. ``frame_dt`` has to be
-  given. A folder with files that a PVD or XDMF file beside it lists is none.
+- a folder ``NAME/`` with one file per frame, of any format that meshio reads. Their names differ in numbers that rise from frame to frame. ``frame_dt`` has to
+  be given. A folder with files that a PVD or XDMF file beside it lists is none.
 
 Arrays are found by their names. ``arrays={displacement: U, stress: S}`` names those that are called otherwise in the files:
 
@@ -101,7 +101,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     for role in settings.arrays or {}:
         if role not in ROLES:
             raise ImportFailure(f"arrays.{role}: unknown{did_you_mean(role, ROLES)}; arrays are {', '.join(ROLES)}")
-    folders, warnings = split_folders(path)
+    folders, warnings = split_folders(path, *ENDINGS)
     found = {split: _trajectories(folder) for split, folder in (folders or {"train": path}).items()}
     splits = {split: [Item(place.stem, partial(_load, place, settings)) for place in places] for split, places in found.items() if places}
     if not splits:

@@ -364,13 +364,14 @@ def test_a_missing_number_is_told(tmp_path: Path, numbers: str, missing: tuple[s
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        ("a_0.vtu a_1.vtu a_2.vtu b_0.vtu b_1.vtu b_2.vtu", "a_0.vtu and b_0.vtu: names of the frames of a series differ in one number only; give each"),
-        ("run1_0.vtu run1_1.vtu run2_0.vtu run2_1.vtu", "run1_0.vtu and run2_0.vtu: names of the frames of a series differ in one number only"),
+        ("a_0.vtu a_1.vtu a_2.vtu b_0.vtu b_1.vtu b_2.vtu", "a_0.vtu and b_0.vtu: .* differ in numbers only, which rise together; give each"),
+        ("run1_0.vtu run1_1.vtu run2_0.vtu run2_1.vtu", "run1_0.vtu and run2_0.vtu: names of the frames of a series differ in numbers only"),
         ("run1.000.vtu run1.001.vtu run1.002.vtu run2.000.vtu run2.001.vtu", "between run1.002.vtu and run2.000.vtu, files are missing"),
-        ("0.vtk 0.vtu 1.vtk 1.vtu 2.vtk 2.vtu", "0.vtk and 0.vtu: names of the frames of a series differ in one number only"),
-        ("start.vtu a_0.vtu a_1.vtu", "a_0.vtu and start.vtu: names of the frames of a series differ in one number only"),
+        ("0.vtk 0.vtu 1.vtk 1.vtu 2.vtk 2.vtu", "0.vtk and 0.vtu: names of the frames of a series differ in numbers only"),
+        ("start.vtu a_0.vtu a_1.vtu", "a_0.vtu and start.vtu: names of the frames of a series differ in numbers only"),
         ("a_0.vtu a_1.vtu a_01.vtu a_2.vtu", "a_01.vtu and a_1.vtu have the same number; number the frames 0, 1, 2"),
         ("a_0001_0.vtu a_0002_0.vtu a_0003_0.vtu", ""),  # of part 0
+        ("a_08_t0.8.vtu a_09_t0.9.vtu a_10_t1.0.vtu a_11_t1.1.vtu", ""),
         ("a_0.90.vtu a_0.95.vtu a_1.00.vtu a_1.05.vtu", ""),
     ],
 )  # fmt: skip
@@ -523,6 +524,13 @@ def test_a_folder_of_several_collections_is_no_trajectory(tmp_path: Path, files:
     write_collections(tmp_path / "raw", files)
     report = import_dataset(tmp_path / "data", ImportSettings("meshio", str(tmp_path / "raw"), "set", holdout=0.0))
     assert not report.refusals and report.splits["train"].trajectories == 2
+
+
+def test_files_beside_the_folders_of_splits_are_named(tmp_path: Path) -> None:
+    write_xdmf(tmp_path / "raw" / "train")
+    write_xdmf(tmp_path / "raw")
+    settings = ImportSettings("meshio", str(tmp_path / "raw"), "set", holdout=0.0, arrays={"stress": "S"})
+    assert "1 files beside train/ were not read, the first is beam.xdmf" in " ".join(import_dataset(tmp_path / "data", settings).warnings)
 
 
 def test_a_folder_with_the_values_of_an_xdmf_file_is_no_trajectory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
