@@ -28,7 +28,7 @@ def write_tables(folder: Path, runs: list[Run]) -> Path:
         Path of the table in Markdown. It does not exist if no run has finished.
 
     Raises:
-        TableError: the runs do not belong in one table (see ``domain_table.report_domains``).
+        TableError: the runs do not belong in one table (see ``domain_table.report_domains`` and ``scale_table.report_scales``).
     """
     if runs and all(map(is_evaluation, runs)):
         report_evaluations(folder, runs)

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from gpe_pl.evaluation.metric_rows import LEARNED, Row, read_rows, write_rows
 from gpe_pl.files import sealed
+from gpe_pl.reports.domain_table import TableError
 from gpe_pl.reports.finished_runs import finished_runs
 from gpe_pl.reports.tables import write_tables
 
@@ -85,3 +89,36 @@ def test_runs_without_a_common_instant_are_compared_over_their_full_length(tmp_p
     header, _, line, *_ = (tmp_path / "scales.md").read_text().splitlines()
     assert "specialist at full [1e-3 m²]" in header
     assert "1.25 [1.25, 1.25]" in line
+
+
+def change(folder: Path, part: str, **values: Any) -> None:
+    config = sealed.read(folder / "config.json", "")
+    sealed.write(folder / "config.json", config | {part: config[part] | values})
+
+
+@pytest.mark.parametrize(
+    ("part", "values", "axis"),
+    [
+        ("data", {"name": "snow"}, "data.name"),
+        ("model", {"_target_": "gpe_pl.models.gns.GNS"}, "model._target_"),
+        ("training", {"num_steps": 20}, "training.num_steps"),
+    ],
+)
+def test_runs_of_other_domains_models_or_settings_are_no_seeds(tmp_path: Path, part: str, values: dict[str, Any], axis: str) -> None:
+    for name, use in (("one", "one"), ("other", "one"), ("told", "dimensionless")):
+        write_run(tmp_path / name, use, 1.0, 1, 1e-3)
+    change(tmp_path / "other", part, **values)
+    with pytest.raises(TableError, match=f"graph.scales=one at 20 mm and 5 ms differ in {axis}, not in the seed alone"):
+        write_tables(tmp_path, finished_runs(tmp_path))
+    assert not (tmp_path / "scales.md").exists()
+
+
+@pytest.mark.parametrize(
+    ("part", "values"), [("model", {"_target_": "gpe_pl.models.gns.GNS"}), ("data", {"solver": {"frame_dt": 0.005, "law": "snow"}})]
+)
+def test_a_specialist_of_another_model_or_material_does_not_compare(tmp_path: Path, part: str, values: dict[str, Any]) -> None:
+    write_run(tmp_path / "one", "one", 1.0, 1, 1e-3)
+    write_run(tmp_path / "told", "dimensionless", 1.0, 1, 1e-3)
+    change(tmp_path / "one", part, **values)
+    with pytest.raises(TableError, match="models of one scale and of several scales differ in"):
+        write_tables(tmp_path, finished_runs(tmp_path))
