@@ -1,7 +1,7 @@
 """Table of trials: for each model and domain, compares several settings and marks the best.
 
-Settings are compared by the rollout MSE over all frames. It is averaged over the trajectories of a split; then the median over seeds is taken. Failed rollouts
-count as in ``finished_runs.rollout_errors``.
+Settings are compared by the rollout MSE over all frames. It is averaged over the trajectories of a split that all runs of a domain have evaluated; then the
+median over seeds is taken. Failed rollouts count as in ``finished_runs.rollout_errors``.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from gpe_pl.reports.finished_runs import (
     distinct_runs,
     rollout_errors,
     shared_table,
+    shared_trajectories,
     starts_of,
     validation_curve,
     values_by_seed,
@@ -58,18 +59,25 @@ def report_trials(folder: Path, runs: list[Run]) -> None:
     splits = sorted({split for run in runs for split in run.rows["split"]})
     columns = [key.rpartition(".")[2] for key in settings]
     _write_csv(folder / TRIALS_CSV, groups, settings, columns, splits)
+    scenes, left_out = _scenes(groups, splits)
     header = ["domain", "model", *columns, "seeds", "one-step nMSE", *splits]
     lines = [table_row(header), "|" + "---|" * len(header)]
     for (domain, model), members in sorted(groups.items()):
         variants: dict[tuple[str, ...], list[Run]] = defaultdict(list)
         for run in members:
             variants[tuple(str(run.config.get(key)) for key in settings)].append(run)
-        error = {v: {s: _error(runs, s) for s in splits} for v, runs in variants.items()}
+        error = {v: {s: _error(runs, s, scenes[domain, s]) for s in splits} for v, runs in variants.items()}
         best = {s: min(error[v][s] for v in variants) for s in splits}
         is_compared = len(starts_of(members)) < 2
         for v, runs in sorted(variants.items()):
             cells = [
-                _cell(runs, s, error[v][s], is_best=bool(is_compared and np.isfinite(error[v][s]) and error[v][s] == best[s]))
+                _cell(
+                    runs,
+                    s,
+                    scenes[domain, s],
+                    error[v][s],
+                    is_best=bool(is_compared and np.isfinite(error[v][s]) and error[v][s] == best[s]),
+                )
                 for s in splits
             ]
             losses = [loss[-1] for _, loss in (validation_curve(r) for r in runs) if len(loss)]
@@ -79,7 +87,7 @@ def report_trials(folder: Path, runs: list[Run]) -> None:
         "it says nothing about training by other seeds). A rollout that had to be stopped has failed, and counts as ballistic flight in the same scene. Bold: "
         "best of a domain and model. "
         "One-step nMSE: of the validation split, relative to free fall."
-    )
+    ) + (f" Left out, because not all runs have them: {', '.join(left_out)}." if left_out else "")
     starts = next((found for members in groups.values() if len(found := starts_of(members)) > 1), [])
     warning = ["", f"**{DIFFERENT_STARTS.format(', '.join(starts))}**"] if starts else []
     replace_text(folder / TRIALS_MD, "\n".join([*lines, "", note, *warning, ""]))
@@ -109,17 +117,33 @@ def _settings(runs: list[Run]) -> list[str]:
     return [*keys, NUM_STEPS] if any(len(found) > 1 for found in steps.values()) else keys
 
 
-def _error(runs: list[Run], split: str) -> float:
-    errors = shared_table(rollout_errors(runs, split, "full"))
+def _scenes(groups: dict[tuple[str, str], list[Run]], splits: list[str]) -> tuple[dict[tuple[str, str], list[int]], list[str]]:
+    """Return the trajectories that all runs of a domain have evaluated, by domain and split, and in words those that some runs lack."""
+    scenes, left_out = {}, []
+    for domain in sorted({domain for domain, _ in groups}):
+        runs = [run for (d, _), members in groups.items() if d == domain for run in members]
+        for split in splits:
+            errors = rollout_errors(runs, split, "full")
+            scenes[domain, split] = shared_trajectories(errors)
+            count = len({trajectory for seed in errors for trajectory in seed})
+            if missing := count - len(scenes[domain, split]):
+                left_out.append(f"{missing} of {count} trajectories of `{split}` of {domain}")
+    return scenes, left_out
+
+
+def _error(runs: list[Run], split: str, scenes: list[int]) -> float:
+    errors = shared_table(rollout_errors(runs, split, "full"), scenes)
     return float(median_of_means(errors, BOTH)) if errors.size else float("inf")
 
 
-def _cell(runs: list[Run], split: str, error: float, *, is_best: bool) -> str:
-    as_they_are = shared_table(values_by_seed(runs, LEARNED, split, "rollout_mse", "full"))
+def _cell(runs: list[Run], split: str, scenes: list[int], error: float, *, is_best: bool) -> str:
+    as_they_are = shared_table(values_by_seed(runs, LEARNED, split, "rollout_mse", "full"), scenes)
+    if not as_they_are.size:
+        return "–"
     failed = f"{int((~np.isfinite(as_they_are)).sum())} of {as_they_are.size} failed"
     if not np.isfinite(error):  # ballistic flight was not evaluated
         return failed
-    i = bootstrap_interval(shared_table(rollout_errors(runs, split, "full")), statistic=median_of_means)
+    i = bootstrap_interval(shared_table(rollout_errors(runs, split, "full"), scenes), statistic=median_of_means)
     text = f"{1e3 * error:.3g}"
     cell = f"{f'**{text}**' if is_best else text} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
     return cell if np.isfinite(as_they_are).all() else f"{cell}, {failed}"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
+from gpe_pl.evaluation.metric_rows import LEARNED, Row, read_rows, write_rows
 from gpe_pl.files import sealed
 from gpe_pl.reports.finished_runs import finished_runs
 from gpe_pl.reports.stride_table import DIFFERENT_STARTS
@@ -118,3 +118,35 @@ def test_a_table_of_models_does_not_outlive_a_comparison_of_settings(tmp_path: P
     report_trials(tmp_path, finished_runs(tmp_path))
     assert not (tmp_path / "table1.md").exists()
     assert "now compares settings (training.velocity_noise_of_change)" in caplog.text
+
+
+def table_of(folder: Path) -> list[list[str]]:
+    lines = (folder / "trials.md").read_text().splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")][2:]
+
+
+def test_settings_are_compared_on_the_trajectories_that_all_runs_of_a_domain_have(tmp_path: Path) -> None:
+    """The setting with noise 0.3 has half the error in every scene; that with 1.0 lacks the scenes with large errors."""
+    write_run(tmp_path / "a", "sand", "GPE", 0.3, 0, [1e-3, 1e-3, 10e-3, float("inf")])
+    write_run(tmp_path / "b", "sand", "GPE", 1.0, 0, [2e-3, 2e-3])
+    write_run(tmp_path / "c", "sand", "GNS", 0.3, 0, [3e-3, 3e-3, 3e-3, 3e-3])
+    write_run(tmp_path / "d", "snow", "GNS", 0.3, 0, [3e-3, 5e-3, 7e-3])
+    report_trials(tmp_path, finished_runs(tmp_path))
+    assert [row[-1] for row in table_of(tmp_path)] == ["**3** [3, 3]", "**1** [1, 1]", "2 [2, 2]", "**5** [3, 7]"]
+    text = (tmp_path / "trials.md").read_text()
+    assert "Left out, because not all runs have them: 2 of 4 trajectories of `val` of sand." in text and "of snow" not in text
+
+
+def test_trajectories_that_all_runs_have_need_no_note(trials: Path) -> None:
+    report_trials(trials, finished_runs(trials))
+    assert "Left out" not in (trials / "trials.md").read_text()
+
+
+def test_runs_without_shared_trajectories_have_no_errors_to_compare(tmp_path: Path) -> None:
+    for name, noise in (("a", 0.3), ("b", 1.0)):
+        write_run(tmp_path / name, "sand", "GPE", noise, 0, [1e-3, 2e-3])
+        rows = list(read_rows(tmp_path / name / "metrics.csv"))
+        write_rows(tmp_path / name / "metrics.csv", [row for row in rows if row.trajectory == (name == "a")])
+    report_trials(tmp_path, finished_runs(tmp_path))
+    assert [row[-1] for row in table_of(tmp_path)] == ["–", "–"]
+    assert "2 of 2 trajectories of `val` of sand." in (tmp_path / "trials.md").read_text()
