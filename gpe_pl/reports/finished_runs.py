@@ -184,15 +184,21 @@ def starts_of(runs: Iterable[Run]) -> list[str]:
 
 
 def _start(run: Run) -> str | None:
-    time, frame_dt = run.config.get("evaluation.start_time"), run.config.get("data.solver.frame_dt")
+    time, frame_dt = run.config.get("evaluation.start_time"), _of_evaluated_data(run, "solver.frame_dt")
     if time is not None:
         return f"{time:g} s"
     frame = run.config.get("evaluation.start_frame")  # of earlier versions
     frame = run.config.get("graph.history") if frame is None else frame
     if frame is None:
         return None
-    frame *= run.config.get("data.stride", 1)
+    stride = _of_evaluated_data(run, "stride")
+    frame *= 1 if stride is None else stride
     return f"frame {frame}" if frame_dt is None else f"{frame * frame_dt:g} s"
+
+
+def _of_evaluated_data(run: Run, key: str) -> Any:
+    """Return a setting of the data that a run was evaluated on: those that it was trained on, unless ``evaluation.data`` says otherwise."""
+    return run.config.get(f"evaluation.data.{key}", run.config.get(f"data.{key}"))
 
 
 def distinct_runs(runs: list[Run]) -> list[Run]:

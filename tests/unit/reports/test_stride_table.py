@@ -8,7 +8,7 @@ from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
 from gpe_pl.evaluation.rollout_cost import Timed, read_cost, write_cost
 from gpe_pl.files import sealed
 from gpe_pl.reports import sweep_table
-from gpe_pl.reports.finished_runs import archive, finished_runs
+from gpe_pl.reports.finished_runs import Run, archive, finished_runs, starts_of, table_of
 from gpe_pl.rollout.baselines import ConstantVelocity
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -95,3 +95,16 @@ def test_a_timed_simulator_makes_the_same_steps(trajectory: Trajectory) -> None:
     assert (alone.pos == ConstantVelocity(0.01).step(state).pos).all()
     assert len(timed.seconds) == 3 and min(timed.seconds) >= 0
     assert (together[0].pos == alone.pos).all()  # type: ignore[union-attr]
+
+
+def test_starts_are_counted_in_frames_of_the_evaluation() -> None:
+    """Scenes of the evaluation can have longer frames than those of the training."""
+
+    def start(**of_evaluation: float) -> list[str]:
+        config = {"graph.history": 2, "data.stride": 1, "data.solver.frame_dt": 0.0025}
+        config |= {f"evaluation.data.{key.replace('__', '.')}": value for key, value in of_evaluation.items()}
+        return starts_of([Run(Path(), config, table_of([]))])
+
+    assert start() == ["0.005 s"]
+    assert start(stride=4) == ["0.02 s"]
+    assert start(stride=4, solver__frame_dt=0.01) == ["0.08 s"]
