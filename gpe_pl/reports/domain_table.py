@@ -211,11 +211,18 @@ def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, C
 
 
 def _write_csv(path: Path, runs: Sequence[Run]) -> None:
-    """Write means over trajectories: one line per domain, model, seed, split and metric, one column per horizon. Only trained models have a seed."""
+    """Write means over trajectories: one line per domain, model, seed, split and metric, one column per horizon. Only trained models have a seed.
+
+    Means are over the trajectories that all runs of a domain have evaluated, so a trivial baseline has the same mean in all of them.
+    """
     keys = ["domain", "model", "seed", "split", "metric"]
+    scenes = {domain: _evaluated_by_all(domain, runs) for domain in sorted({domain_of(run) for run in runs})}
     tables = []
     for run in runs:
-        rows = with_groups(run.rows)
+        shared = [
+            trajectory in scenes[domain_of(run)][split] for split, trajectory in zip(run.rows["split"], run.rows["trajectory"], strict=True)
+        ]
+        rows = with_groups(run.rows[shared])
         is_own = rows["model"].str.startswith(LEARNED)  # also with other parameters
         rows = rows.assign(domain=domain_of(run), seed=np.where(is_own, str(run.config.get("seed")), ""))
         models = rows["model"].str.replace(LEARNED, model_of(run), n=1).where(is_own, rows["model"])
@@ -225,6 +232,27 @@ def _write_csv(path: Path, runs: Sequence[Run]) -> None:
     means = means[sorted(means.columns, key=time_of)]
     with replacing(path) as part:
         means.sort_index().to_csv(part, float_format="%.6g", lineterminator="\n", na_rep="")
+
+
+def _evaluated_by_all(domain: str, runs: Sequence[Run]) -> dict[str, set[int]]:
+    """Return the trajectories of each split that all runs of a domain have evaluated, of those runs that have the split."""
+    evaluated: dict[str, list[set[int]]] = defaultdict(list)
+    for run in runs:
+        if domain_of(run) == domain:
+            for (split, _), rows in run.rows[run.rows["model"].isin([LEARNED, *BASELINES])].groupby(["split", "model"]):
+                evaluated[split].append({*rows["trajectory"]})
+    for split, sets in evaluated.items():
+        shared, every = set.intersection(*sets), set.union(*sets)
+        if shared != every:
+            log.warning(
+                "%s: means of %s over the %d of %d trajectories of %s that all runs have evaluated",
+                TABLE_CSV,
+                domain,
+                len(shared),
+                len(every),
+                split,
+            )
+    return {split: set.intersection(*sets) for split, sets in evaluated.items()}
 
 
 def _markdown(
