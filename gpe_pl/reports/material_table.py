@@ -89,9 +89,10 @@ def material_lines(groups: Groups) -> list[str]:
     ]  # fmt: skip
     lines = [table_row(header), "|" + "---|" * len(header)]
     for (domain, label), runs in shown.items():
-        own, effect = _mean(_errors(runs, LEARNED)), _mean(_solver(runs, SOLVER_ENDS))
-        others = [_mean(_errors(runs, label_of(LEARNED, control))) for control in CONTROLS]
-        means = [own, *others, _mean(_errors(_without(groups, domain, runs), LEARNED)), _mean(_solver(runs, SOLVER_NEAREST)), effect]
+        learned = [_errors(runs, label) for label in (LEARNED, *(label_of(LEARNED, control) for control in CONTROLS))]
+        solver = [_solver(runs, label) for label in (SOLVER_NEAREST, SOLVER_ENDS)]
+        means = _means([*learned, _errors(_without(groups, domain, runs), LEARNED), *solver])
+        own, effect = means[0], means[-1]
         found = reads_material(runs)
         assert found is not None
         fraction = f"{own / effect:.2f}" if effect > 0 else "–"
@@ -117,7 +118,7 @@ def _horizon_lines(groups: Groups) -> list[str]:
     lines = [table_row(["domain", "model", *columns]), "|" + "---|" * (2 + len(columns))]
     for (domain, label), runs in groups.items():
         nearest = [_ratio(found[0]) if (found := _over(runs, "nearest", horizon)) else "–" for horizon in horizons]
-        effects = [(_mean(_errors(runs, LEARNED, horizon)), _mean(_solver(runs, SOLVER_ENDS, horizon))) for horizon in horizons]
+        effects = [_means([_errors(runs, LEARNED, horizon), _solver(runs, SOLVER_ENDS, horizon)]) for horizon in horizons]
         lines.append(table_row([domain, label, *nearest, *(f"{own / effect:.2f}" if effect > 0 else "–" for own, effect in effects)]))
     return ["", *lines, "", "The same ratios for means over the frames up to a horizon."]
 
@@ -193,8 +194,10 @@ def _solver(runs: Sequence[Run], label: str, horizon: str = FULL) -> Values:
     return values_by_seed(list(runs[:1]), label, INTERPOLATED, "rollout_mse", horizon)
 
 
-def _mean(values: Values) -> float:
-    return float(median_of_means(shared_table(values), axis=(-2, -1))) if values else float("nan")
+def _means(tables: Sequence[Values]) -> list[float]:
+    """Return the mean of each table over the scenes that all of them have, median over seeds [m²]; NaN for an empty table or without such scenes."""
+    scenes = shared_trajectories(*tables)
+    return [float(median_of_means(shared_table(own, scenes), axis=(-2, -1))) if own and scenes else float("nan") for own in tables]
 
 
 def _text(value: float) -> str:
