@@ -106,17 +106,24 @@ def _archived(folder: Path) -> list[Run]:
 
 
 def finished_runs(folder: Path) -> list[Run]:
-    """Return all finished training runs below a folder, in order of their paths, or those of an archive in it.
+    """Return all finished training runs below a folder, in order of their paths. Those of an archive in it come first.
 
-    Folders that ``evaluate`` has written are not training runs. The keys in ``WITHOUT_CONSEQUENCE`` are left out of the configurations.
+    A run in its own folder replaces the same run in the archive, because it may be newer. Folders that ``evaluate`` has written are not training runs. The keys
+    in ``WITHOUT_CONSEQUENCE`` are left out of the configurations.
 
     Raises:
         RunError: a configuration cannot be read, or has values of other types than ``TRAINED``.
         MetricsError: a ``metrics.csv`` is damaged.
         ArchiveError: the archive is damaged.
     """
-    if (folder / run_archive.RUNS).exists():
-        return _archived(folder)
+    archived = _archived(folder) if (folder / run_archive.RUNS).exists() else []
+    runs = [*{run.folder: run for run in [*archived, *_in_own_folders(folder)]}.values()]
+    _warn_of_replaced_data(runs)
+    return runs
+
+
+def _in_own_folders(folder: Path) -> list[Run]:
+    """Return all finished training runs below a folder that are not in an archive, in order of their paths."""
     runs = []
     for path in sorted(folder.rglob("metrics.csv")):
         config = path.parent / "config.json"
@@ -136,7 +143,6 @@ def finished_runs(folder: Path) -> list[Run]:
                     path.parent,
                     ", ".join(sorted(TRAINED.keys() - said.keys())),
                 )
-    _warn_of_replaced_data(runs)
     return runs
 
 

@@ -98,3 +98,15 @@ def test_what_runs_have_in_common_is_said_once(archived: Path) -> None:
         "a": "gpe_pl.models.x.GPE",
         "b": "gpe_pl.models.x.GNS",
     }
+
+
+def test_runs_that_finished_beside_an_archive_join_its_runs(archived: Path, tmp_path: Path) -> None:
+    write_run(archived / "c", "sand", "DPINet", 0, [2e-3, 2e-3])
+    assert [run.folder.name for run in finished_runs(archived)] == ["a", "b", "c"]
+
+
+def test_a_run_in_its_folder_replaces_itself_in_the_archive(archived: Path, tmp_path: Path) -> None:
+    write_run(archived / "a", "sand", "GPE", 0, [7e-3, 7e-3])
+    runs = finished_runs(archived)
+    assert [run.folder.name for run in runs] == ["a", "b"]
+    assert 7e-3 in runs[0].rows["value"].tolist() and runs[0].curve is None
