@@ -79,6 +79,10 @@ SAME_IN_A_ROW = (
 """Prefixes of the configuration keys that must be equal for all models of a domain."""
 
 
+WHOLE_SPLIT = -1
+"""Number of the trajectory in rows of a metric of a whole split."""
+
+
 class TableError(GpeError, ValueError):
     """Raised when runs do not belong in one table. The message names them and says what to do."""
 
@@ -235,12 +239,12 @@ def _write_csv(path: Path, runs: Sequence[Run]) -> None:
 
 
 def _evaluated_by_all(domain: str, runs: Sequence[Run]) -> dict[str, set[int]]:
-    """Return the trajectories of each split that all runs of a domain have evaluated, of those runs that have the split."""
+    """Return the trajectories of each split that all runs of a domain have evaluated, of those runs that have the split; and ``WHOLE_SPLIT``."""
     evaluated: dict[str, list[set[int]]] = defaultdict(list)
     for run in runs:
         if domain_of(run) == domain:
             for (split, _), rows in run.rows[run.rows["model"].isin([LEARNED, *BASELINES])].groupby(["split", "model"]):
-                evaluated[split].append({*rows["trajectory"]})
+                evaluated[split].append({*rows["trajectory"]} - {WHOLE_SPLIT})
     for split, sets in evaluated.items():
         shared, every = set.intersection(*sets), set.union(*sets)
         if shared != every:
@@ -252,7 +256,7 @@ def _evaluated_by_all(domain: str, runs: Sequence[Run]) -> dict[str, set[int]]:
                 len(every),
                 split,
             )
-    return {split: set.intersection(*sets) for split, sets in evaluated.items()}
+    return {split: set.intersection(*sets) | {WHOLE_SPLIT} for split, sets in evaluated.items()}
 
 
 def _markdown(

@@ -311,12 +311,15 @@ def test_the_csv_has_the_means_over_the_trajectories_that_all_runs_of_a_domain_h
 ) -> None:
     write_run(tmp_path / "GNS", "sand", "GNS", 0, [4e-3, 6e-3, 50e-3, 50e-3], ballistic=[10e-3, 20e-3, 90e-3, 90e-3])
     write_run(tmp_path / "GPE", "sand", "GPE", 0, [1e-3, 3e-3], ballistic=[10e-3, 20e-3])
-    write_run(tmp_path / "snow", "fem", "GPE", 0, [1e-3, 3e-3, 5e-3])
+    write_run(tmp_path / "fem", "fem", "GPE", 0, [1e-3, 3e-3, 5e-3])
+    whole = Row(LEARNED, "test_unseen", -1, "", float("nan"), "one_step_nmse", "1", 0.7)
+    write_rows(tmp_path / "GNS" / "metrics.csv", [*read_rows(tmp_path / "GNS" / "metrics.csv"), whole])
     report_domains(tmp_path, finished_runs(tmp_path))
     with open(tmp_path / "table1.csv", newline="") as handle:
-        found = {(r["domain"], r["model"], r["split"]): float(r["full"]) for r in csv.DictReader(handle)}
+        found = {(r["domain"], r["model"], r["split"]): float(r["full"]) for r in csv.DictReader(handle) if r["full"]}
     own = {model: found["sand", model, "test_unseen"] for model in ("GPE", "GNS", "ballistic")}
     assert own == pytest.approx({"GPE": 2e-3, "GNS": 5e-3, "ballistic": 15e-3})
     assert found["sand", "GNS", "test_unseen/extrapolated"] == pytest.approx(6e-3)
     assert found["sand", "GNS", "test"] == pytest.approx(1e-3) and found["fem", "GPE", "test_unseen"] == pytest.approx(3e-3)
+    assert "sand,GNS,0,test_unseen,one_step_nmse,0.7," in (tmp_path / "table1.csv").read_text()  # of the whole split
     assert "table1.csv: means of sand over the 2 of 4 trajectories of test_unseen that all runs have evaluated" in caplog.text
