@@ -158,8 +158,8 @@ class _Tally:
 
     def __init__(self, state: State, metadata: Metadata) -> None:
         self.end, self.limit = state, MAX_SPEED_FACTOR * _fall_speed(state, metadata)
-        self.num_corrected, self.num_too_fast, self.top_speed = 0, 0, 0.0
-        self.num_asleep, self.lost_impulse = 0, 0.0
+        self.num_corrected, self.num_too_fast, self.top_speed = 0.0, 0, 0.0
+        self.num_asleep, self.lost_impulse = 0.0, 0.0
         self.seconds: list[float] = []
         self.resume()
 

@@ -89,7 +89,7 @@ def _rigid(before: State, mean: State) -> State:
 
 
 def mean_state(states: Sequence[State]) -> State:
-    """Return the mean of states of one scene at the same time. Along periodic axes, images near the first state are averaged. Counts are rounded down."""
+    """Return the mean of states of one scene at the same time. Along periodic axes, images near the first state are averaged. Counts are means, too."""
     first = states[0]
     pos = first.pos + _mean([first.periodicity.shortest(state.pos - first.pos) for state in states])
     stress = [state.stress for state in states if state.stress is not None]
@@ -100,8 +100,8 @@ def mean_state(states: Sequence[State]) -> State:
         velocity_history=_mean_of_all([state.velocity_history for state in states]),
         frame_velocity=_mean_of_all([state.frame_velocity for state in states]),
         stress=Stress(_mean([s.node for s in stress]), _mean([s.cell for s in stress])) if len(stress) == len(states) else None,
-        num_corrected=sum(state.num_corrected for state in states) // len(states),
-        num_asleep=sum(state.num_asleep for state in states) // len(states),
+        num_corrected=sum(state.num_corrected for state in states) / len(states),
+        num_asleep=sum(state.num_asleep for state in states) / len(states),
         lost_impulse=sum(state.lost_impulse for state in states) / len(states),
     )
 

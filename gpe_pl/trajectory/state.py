@@ -82,8 +82,8 @@ class State:
         cell_dim: dimension of the cells, 2 for surfaces in 3D; None stands for the dimension of space. See ``cells.kinds_of``.
         stress: stress of the mesh or of particles; None if the simulator does not compute it.
         num_substeps: number of solver substeps in the last frame.
-        num_corrected: number of nodes that containment put back in the last frame.
-        num_asleep: number of sleeping nodes, which the simulator did not compute in the last frame.
+        num_corrected: number of nodes that containment put back in the last frame; of an ensemble, the mean over its members.
+        num_asleep: number of sleeping nodes, which the simulator did not compute in the last frame; of an ensemble, the mean over its members.
         lost_impulse: momentum [kg m/s] that the sleeping nodes lost, as the sum of magnitudes.
         internal: private data of a solver or simulator, such as deformation gradients. With it, a rollout can continue from any state as if it had not been
             interrupted. It is not stored.
@@ -111,8 +111,8 @@ class State:
     stress: Stress | None = field(default=None, metadata=STEP)
     cell_dim: int | None = field(default=None, metadata=SCENE)
     num_substeps: int = field(default=0, metadata=STEP)
-    num_corrected: int = field(default=0, metadata=STEP)
-    num_asleep: int = field(default=0, metadata=STEP)
+    num_corrected: int | float = field(default=0, metadata=STEP)
+    num_asleep: int | float = field(default=0, metadata=STEP)
     lost_impulse: float = field(default=0.0, metadata=STEP)
     internal: Any = field(default=None, metadata=STEP)
     frame_velocity: Array | None = field(default=None, metadata=NODE)

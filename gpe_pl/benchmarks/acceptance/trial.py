@@ -137,7 +137,7 @@ def advanced(solver: Simulator, state: State, num_steps: int) -> State:
 
 def predicted(candidate: Candidate, state: State, truth: Trajectory) -> tuple[Trajectory, float]:
     """Return the rollout of the model over the frames of the truth, and the fraction of particle-steps that containment corrected."""
-    metadata, num_corrected = truth.metadata, 0
+    metadata, num_corrected = truth.metadata, 0.0
     speed = FASTER * max(1.0, float(np.linalg.norm(truth.vel, axis=-1).max()))
     margin = max(high - low for low, high in metadata.bounds)
 

@@ -54,7 +54,7 @@ def long_horizon(subject: Subject) -> Outcome:
         Start(subject.simulator.initial_state(truth, subject.history), num_steps, truth.metadata, subject.guard())
         for truth in subject.scenes
     ]
-    num_corrected = 0
+    num_corrected = 0.0
 
     def count(_: int, __: int, state: State) -> None:
         nonlocal num_corrected

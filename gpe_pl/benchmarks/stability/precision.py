@@ -129,7 +129,7 @@ def sleeping(subject: Subject, num_steps: int = 20) -> tuple[float, float, float
         The mean squared error with sleeping over that without, the time without sleeping over that with, and the fraction of particle-steps asleep.
     """
     runners = {"asleep": approximate(_skipping(subject, ASLEEP)), "awake": subject.simulator}
-    errors, seconds, num_asleep, num_steps_of_nodes = dict.fromkeys(runners, 0.0), dict.fromkeys(runners, 0.0), 0, 0
+    errors, seconds, num_asleep, num_steps_of_nodes = dict.fromkeys(runners, 0.0), dict.fromkeys(runners, 0.0), 0.0, 0
 
     def count(_: int, state: State) -> None:
         nonlocal num_asleep, num_steps_of_nodes

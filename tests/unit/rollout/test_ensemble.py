@@ -94,6 +94,13 @@ def test_means_are_taken_across_a_periodic_seam(new_trajectory: object) -> None:
     np.testing.assert_allclose(mean_state([left, right]).pos[0], [0.01, 0.5], atol=1e-12)
 
 
+def test_counts_of_an_ensemble_are_the_means_of_its_members(trajectory: Trajectory) -> None:
+    state = trajectory.state(2, 2)
+    members = [replace(state, num_corrected=count, num_asleep=2 * count) for count in (0, 0, 1)]
+    mean = mean_state(members)
+    assert mean.num_corrected == pytest.approx(1 / 3) and mean.num_asleep == pytest.approx(2 / 3)
+
+
 def test_a_member_that_fails_in_a_single_step_raises(trajectory: Trajectory) -> None:
     with pytest.raises(SimulationError, match="member 1 of 2"):
         Ensemble((Growing(1.0, fails_at=-1.0), Growing(1.0))).step(trajectory.state(0))
