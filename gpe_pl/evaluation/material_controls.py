@@ -8,6 +8,7 @@ changes. The distance between the other two is the effect of the whole trained r
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,6 +26,8 @@ from gpe_pl.schema import Split
 from gpe_pl.system.progress import Progress
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.captions import row_label
+
+log = logging.getLogger(__name__)
 
 UNSEEN: Split = "test_unseen"
 """Split whose scenes get controls."""
@@ -71,7 +74,7 @@ class MaterialControls:
     stride: int = 1
 
     def prepare(self, num_workers: int = 1, on_progress: Progress | None = None) -> None:
-        """Compute the missing solver runs.
+        """Compute the missing solver runs. Warn of scenes without shuffled values.
 
         Raises:
             ControlError: the data set has no scenes with unseen parameters, or they are too short, or its train split has a single value.
@@ -86,6 +89,12 @@ class MaterialControls:
             raise ControlError(
                 f"evaluation.material_controls=true: all trajectories ({self.trained.num_train}) in the train split of {self.trained.name} have the same "
                 "material parameters, so there is nothing to compare; choose a larger data.num_train, or false"
+            )
+        if missing := sum("shuffled" not in scene for scene in self.values):
+            log.warning(
+                "evaluation.material_controls=true: %d of %d scenes in %s of %s are not rolled out at shuffled values, because no scene of their group has "
+                "other values",
+                *(missing, len(self.values), UNSEEN, self.spec.name),
             )
         self._runs.generate(self._indices, num_workers, on_progress)
 
@@ -103,7 +112,7 @@ class MaterialControls:
                     )
 
     def predictions(self, simulator: Simulator, starts: Sequence[Start], numbers: Sequence[int]) -> list[dict[str, Trajectory]]:
-        """Return the model's rollouts of each scene, by name in ``CONTROLS``.
+        """Return the model's rollouts of each scene, by name in ``CONTROLS``. Scenes without shuffled values lack that rollout.
 
         Args:
             simulator: the model, wrapped as for its other rollouts, for example with containment.
@@ -112,9 +121,10 @@ class MaterialControls:
         """
         found: list[dict[str, Trajectory]] = [{} for _ in starts]
         for control in CONTROLS:
-            changed = [_changed(start, self.values[number][control]) for number, start in zip(numbers, starts, strict=True)]
-            for scene, prediction in zip(found, rollouts(simulator, changed), strict=True):
-                scene[control] = prediction
+            chosen = [k for k, number in enumerate(numbers) if control in self.values[number]]
+            changed = [_changed(starts[k], self.values[numbers[k]][control]) for k in chosen]
+            for k, prediction in zip(chosen, rollouts(simulator, changed), strict=True):
+                found[k][control] = prediction
         return found
 
     def at_three_values(self, simulator: Simulator, start: Start, number: int, truth: Trajectory, prediction: Trajectory) -> list[AtValue]:
@@ -158,23 +168,33 @@ class MaterialControls:
 
     @cached_property
     def values(self) -> list[dict[str, Values]]:
-        """Parameter values of each scene, by name in ``CONTROLS``."""
+        """Parameter values of each scene, by name in ``CONTROLS``. Scenes of a group in which all have the same values have no ``shuffled`` ones."""
         trained, own = TrainedValues(self.trained), [scene_values(self.spec, UNSEEN, k) for k in self._indices]
-        other = self._shuffled()
-        return [
-            dict(zip(CONTROLS, (trained.nearest(v), trained.middle, trained.farthest(v), own[k]), strict=True))
-            for v, k in zip(own, other, strict=True)
+        found: list[dict[str, Values]] = [
+            {"nearest": trained.nearest(v), "middle": trained.middle, "far": trained.farthest(v)} for v in own
         ]
+        for k, other in self._shuffled().items():
+            found[k]["shuffled"] = own[other]
+        return found
 
-    def _shuffled(self) -> list[int]:
-        """Return the number of the scene from which each scene takes its shuffled values. Both have the same group of parameters."""
+    def _shuffled(self) -> dict[int, int]:
+        """Return the number of the scene from which each scene takes its shuffled values. Both have the same group of parameters, and different values.
+
+        Scenes for which there is no such scene are left out.
+        """
         dealt = [parameter_values(self.spec, UNSEEN, k) for k in self._indices]
-        other, rng = np.arange(len(dealt)), np.random.default_rng(0)
+        other, rng = dict[int, int](), np.random.default_rng(0)
         for group in dict.fromkeys(group for _, group in dealt):
             own = np.array([k for k, (_, of) in enumerate(dealt) if of == group])
             drawn = [rng.permutation(own) for _ in range(MOST_DRAWS)]
-            other[own] = min(drawn, key=lambda order: sum(dealt[a][0] == dealt[b][0] for a, b in zip(own, order, strict=True)))
-        return [int(k) for k in other]
+            order = min(drawn, key=lambda order: sum(dealt[a][0] == dealt[b][0] for a, b in zip(own, order, strict=True)))
+            for a, b in zip(own, order, strict=True):
+                different = [
+                    int(k) for k in (b, *own) if dealt[k][0] != dealt[a][0]
+                ]  # where the permutation keeps a value, the first other scene
+                if different:
+                    other[int(a)] = different[0]
+        return other
 
     def _solved(self, number: int) -> dict[str, Trajectory]:
         """Return the solver's runs of a scene by name, with frames as long as the model's."""

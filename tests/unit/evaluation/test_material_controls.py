@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gpe_pl.config.datasets import dataset_spec
-from gpe_pl.data.control_runs import HIGHEST, LOWEST, TrainedValues
+from gpe_pl.data.control_runs import HIGHEST, LOWEST, ControlRuns, TrainedValues, scene_values
 from gpe_pl.data.ground_truth import trajectory_metadata
 from gpe_pl.evaluation import split_files
 from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, ControlError, MaterialControls, label_of
@@ -23,6 +23,8 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout import loop as rollout_loop
+from gpe_pl.rollout.baselines import ConstantVelocity
+from gpe_pl.rollout.loop import Start
 from gpe_pl.schema import node_code
 from gpe_pl.trajectory.store import iter_trajectories
 from tests.runs import DATA, compose
@@ -103,6 +105,32 @@ def test_shuffled_values_are_those_of_another_scene_of_the_group(controls: Mater
     for shuffled, group in ((values[::2], own[0]), (values[1::2], own[1][:10])):
         assert sorted(shuffled) == sorted(group)
         assert sum(a == b for a, b in zip(shuffled, group, strict=True)) <= 1
+
+
+def unseen(controls: MaterialControls, angles: list[float], count: int) -> MaterialControls:
+    """Return controls of scenes that have these interpolated friction angles in turn."""
+    cfg = compose("simulate", *DATA, f"data.parameters.sand.interpolated={angles}")
+    return replace(controls, spec=replace(dataset_spec(cfg), num_test_unseen=count))
+
+
+def test_scenes_without_another_value_have_no_shuffled_one(
+    controls: MaterialControls, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ControlRuns, "generate", lambda *_: None)
+    single = unseen(controls, [31.0], 8)
+    assert [[*scene] == [*CONTROLS] for scene in single.values] == [False, True] * 4
+    single.prepare()
+    assert "4 of 8 scenes in test_unseen of sand are not rolled out at shuffled values" in caplog.text
+    starts = [Start(next(iter_trajectories(controls.root, UNSEEN)).state(0), 1, trajectory_metadata(controls.spec, UNSEEN, 0))] * 2
+    found = single.predictions(ConstantVelocity(0.005), starts, [0, 1])
+    assert [[*scene] for scene in found] == [[*CONTROLS[:-1]], [*CONTROLS]]
+    assert "shuffled" not in single.predictions(ConstantVelocity(0.005), starts[:1], [0])[0]
+
+
+def test_shuffled_values_are_never_a_scenes_own(controls: MaterialControls) -> None:
+    few = unseen(controls, [26.0, 31.0], 6)  # two of three interpolated scenes have the same value
+    own = [scene_values(few.spec, UNSEEN, k) for k in range(6)]
+    assert all(scene["shuffled"] != value for scene, value in zip(few.values, own, strict=True))
 
 
 def test_data_that_the_solver_does_not_reproduce_are_refused(controls: MaterialControls) -> None:
