@@ -120,6 +120,7 @@ class FitRun:
             NoiseError: the noise is too large for the spacing of the scenes.
             CheckpointError: the model of ``start_from`` has other settings.
             StartError: ``evaluation.start_time`` leaves too little history, or is between frames.
+            ControlError: the model of ``start_from`` is not trained here, and its training had other material parameters than these data.
             ConfigError: evaluated data have frames of another length, or windows of the elastic law are to be turned by any angle.
         """
         scenes, evaluated = scene_metadata(self.parts[0], "train"), evaluated_config(self.cfg)
@@ -144,7 +145,10 @@ class FitRun:
         self.others = list(zip(others, map(stride_of, self.parts[1:]), strict=True))
         is_same = not self.cfg.evaluation.data and len(self.parts) == 1
         self.evaluated_root = self.root if is_same else ensure_data(evaluated)
-        self.controls = material_controls(self.cfg, self.evaluation, self.evaluated_root, self.first_frame)
+        untouched = self.start if self.training.num_steps == 0 else None  # later trained on these data
+        self.controls = material_controls(self.cfg, self.evaluation, self.evaluated_root, self.first_frame, untouched)
+        if self.controls is not None and self.start is not None:
+            self.controls.warn_of_start(self.start)
         self.device = set_up(self.trainer)
 
     def choose_num_steps(self) -> None:

@@ -9,7 +9,7 @@ changes. The distance between the other two is the effect of the whole trained r
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -37,6 +37,8 @@ SOLVER_NEAREST, SOLVER_ENDS = "solver at nearest value", "solver at lowest again
 """Labels of the rows that compare a run of the solver with the ground truth, and two runs of the solver with each other."""
 SAME_START = 1e-3
 """Largest difference between a stored frame and the start of the solver's runs [spacings]."""
+SAME_VALUE = 1e-5
+"""Largest relative difference between ends of trained ranges that are the same."""
 MOST_DRAWS = 100
 """Number of random permutations of the scenes' values. The permutation in which the fewest scenes keep their own values is used for ``shuffled``."""
 
@@ -100,15 +102,30 @@ class MaterialControls:
 
     def check_trained(self, simulator: LearnedSimulator) -> None:
         """Raise ``ControlError`` if the trained values of these controls have another range than those with which a model was trained."""
+        for known, own, line in self._ranges(simulator):
+            if not np.allclose(own, known, rtol=SAME_VALUE):
+                raise ControlError(f"evaluation.material_controls=true: {line}; choose the data settings of its training, or false")
+
+    def warn_of_start(self, start: LearnedSimulator) -> None:
+        """Warn if the model from which a training starts knows values outside the trained values of these controls, which are then not all trained ones."""
+        for known, own, line in self._ranges(start):
+            margin = SAME_VALUE * np.abs(own)
+            if np.isfinite(known).all() and (known[0] < own[0] - margin[0] or known[1] > own[1] + margin[1]):
+                log.warning("evaluation.material_controls=true: %s; so unseen values can be known from its first training", line)
+
+    def _ranges(self, simulator: LearnedSimulator) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
+        """Yield the lowest and highest value [2] of each parameter in the training of a model and in the train split, and a message that names them."""
         trained = TrainedValues(self.trained)
         ends = [trained.end(name) for name in (LOWEST, HIGHEST)]
-        for material, known in simulator.trained_ranges():
+        for material, values in simulator.trained_ranges():
             for k, parameter in enumerate(simulator.builder.spec.parameters[material]):
-                own = [end[material][parameter.name] for end in ends if parameter.name in end.get(material, {})]
-                if own and not np.allclose(own, known[:, k].tolist(), rtol=1e-5):
-                    raise ControlError(
-                        f"evaluation.material_controls=true: the model was trained with {parameter.name} of {material} from {known[0, k]:g} to "
-                        f"{known[1, k]:g}, and the train split of these data has {own[0]:g} to {own[1]:g}; choose the data settings of its training, or false"
+                if parameter.name in ends[0].get(material, {}):
+                    known, own = values[:, k].cpu().numpy(), np.array([end[material][parameter.name] for end in ends])
+                    yield (
+                        known,
+                        own,
+                        f"the model was trained with {parameter.name} of {material} from {known[0]:g} to {known[1]:g}, and the train split of these data "
+                        f"has {own[0]:g} to {own[1]:g}",
                     )
 
     def predictions(self, simulator: Simulator, starts: Sequence[Start], numbers: Sequence[int]) -> list[dict[str, Trajectory]]:

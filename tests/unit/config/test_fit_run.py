@@ -7,11 +7,17 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 
+from gpe_pl.config import fit_run
+from gpe_pl.config.datasets import scene_metadata
 from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.config.fit_run import FitRun
 from gpe_pl.errors import GpeError
+from gpe_pl.evaluation.material_controls import ControlError, MaterialControls
 from gpe_pl.files.run_folder import RunError, claim
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import StressError
 from gpe_pl.nn.elastic_bodies import CellError
 from tests.runs import tiny
@@ -48,3 +54,29 @@ def test_a_model_that_does_not_fit_the_materials_is_refused_before_data_are_gene
     with pytest.raises(error, match=message):
         run.prepare_data()
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.fixture
+def trained_elsewhere(tmp_path: Path) -> Path:
+    """A checkpoint of a model that was trained with friction angles from 4° to 10°."""
+    run = FitRun(tiny(tmp_path / "data", tmp_path / "runs"), tmp_path / "first")
+    builder = GraphBuilder(run.graph, scene_metadata(run.parts[0], "train"))
+    simulator = LearnedSimulator(run.new_model(spec=builder.spec), builder)
+    simulator.get_buffer("trained_sand")[:, 0] = torch.tensor([4.0, 10.0])
+    simulator.save(tmp_path / "first.ckpt")
+    return tmp_path / "first.ckpt"
+
+
+def test_controls_of_a_model_that_starts_with_other_values_are_refused_or_warned_of(
+    trained_elsewhere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(fit_run, "ensure_data", lambda _: tmp_path)
+    monkeypatch.setattr(MaterialControls, "prepare", lambda *_: None)
+    settings = (f"start_from={trained_elsewhere}", "evaluation.material_controls=true")
+    message = "the model was trained with friction_angle of sand from 4 to 10, and the train split of these data has"
+    still = FitRun(tiny(tmp_path / "data", tmp_path / "runs", *settings, "training.num_steps=0"), tmp_path / "run")
+    with pytest.raises(ControlError, match=message):
+        still.prepare_data()
+    assert message not in caplog.text
+    FitRun(tiny(tmp_path / "data", tmp_path / "runs", *settings), tmp_path / "run").prepare_data()
+    assert message in caplog.text
