@@ -139,6 +139,7 @@ def _identity(cfg: DictConfig, root: Path, simulator: LearnedSimulator) -> dict[
     from gpe_pl.files.run_folder import DATA_CHECKSUMS
     from gpe_pl.learned.bands import path_beside
     from gpe_pl.learned.pretrained import fingerprint
+    from gpe_pl.training.run import TrainerSettings
 
     checkpoints = _checkpoints(cfg)
     prints = [fingerprint(checkpoint) for checkpoint in checkpoints]
@@ -156,6 +157,7 @@ def _identity(cfg: DictConfig, root: Path, simulator: LearnedSimulator) -> dict[
         DATA_CHECKSUMS: {cfg.split: split_checksum(root, cfg.split)},
         "evaluation": evaluation,
         **{k: values[k] for k in ("data", "rollout")},
+        **construct(TrainerSettings, cfg.trainer, "trainer").identity,
     }
 
 

@@ -255,7 +255,7 @@ class FitRun:
         """Everything that the trained model depends on."""
         own = {key: self._settings[key] for key in ("seed", "size", "data", "graph", "batching", "model")}
         start = {} if self.cfg.start_from is None else {"start_from": fingerprint(self.cfg.start_from)}
-        return own | start | {"training": asdict(self.training), DATA_CHECKSUMS: self._checksums}
+        return own | start | {"training": asdict(self.training), DATA_CHECKSUMS: self._checksums} | self.trainer.identity
 
     @cached_property
     def _config(self) -> dict[str, Any]:

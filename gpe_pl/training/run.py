@@ -175,6 +175,11 @@ class TrainerSettings:
     progress: bool = True
 
     @property
+    def identity(self) -> dict[str, Any]:
+        """The settings that change weights and metrics, as a part of a run's configuration. Defaults are left out, as in folders of earlier versions."""
+        return {} if self.matmul_precision == "highest" else {"trainer": {"matmul_precision": self.matmul_precision}}
+
+    @property
     def device(self) -> str:
         """Type of the device of all tensors: ``cpu`` or ``cuda``."""
         return "cuda" if self.accelerator == "gpu" or (self.accelerator == "auto" and torch.cuda.is_available()) else "cpu"

@@ -16,7 +16,7 @@ import torch
 from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.data.ground_truth import trajectory_metadata
-from gpe_pl.evaluate import evaluate_checkpoint
+from gpe_pl.evaluate import _identity, evaluate_checkpoint
 from gpe_pl.evaluation import showcase
 from gpe_pl.evaluation.metric_rows import Row, read_rows
 from gpe_pl.export.play_model import PageError
@@ -93,6 +93,17 @@ def test_a_folder_keeps_the_evaluation_that_it_holds(tiny_data: Path, tmp_path: 
     (folder / "config.json").unlink()
     with pytest.raises(RunError, match="its config.json is missing"):
         evaluate(tiny_data, tmp_path, run)
+
+
+def test_another_precision_of_products_is_another_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gpe_pl.data.checksum.split_checksum", lambda *_: "same")
+    simulator = LearnedSimulator.from_checkpoint("sand")
+    default, same, medium = (
+        _identity(compose("evaluate", "checkpoint=sand", override), tmp_path, simulator)
+        for override in ("trainer=cpu", "trainer.num_threads=2", "trainer.matmul_precision=medium")
+    )
+    assert "trainer" not in default and same == default
+    assert medium == default | {"trainer": {"matmul_precision": "medium"}}
 
 
 def test_the_folder_is_named_after_model_and_data(tmp_path: Path) -> None:

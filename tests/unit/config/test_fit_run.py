@@ -56,6 +56,17 @@ def test_a_model_that_does_not_fit_the_materials_is_refused_before_data_are_gene
     assert not [*tmp_path.iterdir()]
 
 
+def test_another_precision_of_products_is_another_run_and_the_default_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def trained(*overrides: str) -> dict[str, Any]:
+        run = FitRun(tiny(tmp_path / "data", tmp_path / "runs", *overrides), tmp_path / "run")
+        monkeypatch.setattr(FitRun, "_checksums", {})
+        return run._trained
+
+    default, medium = trained(), trained("trainer.matmul_precision=medium")
+    assert "trainer" not in default and trained("trainer.num_threads=2") == default
+    assert medium == default | {"trainer": {"matmul_precision": "medium"}}
+
+
 @pytest.fixture
 def trained_elsewhere(tmp_path: Path) -> Path:
     """A checkpoint of a model that was trained with friction angles from 4° to 10°."""
