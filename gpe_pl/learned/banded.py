@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,9 @@ from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 log = logging.getLogger(__name__)
+
+ATTRIBUTES = {"clamp_parameters": "clamps_parameters", "static_friction": "static_friction", "mirror_average": "mirror_average"}
+"""Attributes of a simulator that settings of an evaluation change, by setting."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,8 @@ def roll_out_with_bands(
     """Roll a model or an ensemble forward, with error bands, and warn if the scene is unlike those of the calibration.
 
     Bands promise coverage for rollouts as in calibration: contained in walls if these were, from the frame ``bands.start_frame`` of a scene on, and with the
-    same approximate levels of ``LearnedSimulator.skips``; a warning says if these differ.
+    same approximate levels of ``LearnedSimulator.skips``; a warning says if start or levels differ. Another warning says if the bands state another
+    ``static_friction``, ``mirror_average`` or ``clamp_parameters`` than the simulator has. They state those that calibration changed.
 
     Args:
         simulator: trained model, or an ensemble.
@@ -78,6 +83,7 @@ def roll_out_with_bands(
     dt, spreads = metadata.frame_dt, [np.zeros(state.num_nodes)]
     if bands is not None:
         _check_fit(bands, metadata, members[0], state.time)
+        _check_settings(bands, members)
     watch = Watch(members[0], num_steps)
     watch.see(0, state)
 
@@ -126,3 +132,14 @@ def _check_fit(bands: Bands, metadata: Metadata, simulator: LearnedSimulator, st
             bands.start_frame,
             frame,
         )
+
+
+def _check_settings(bands: Bands, members: Sequence[LearnedSimulator]) -> None:
+    """Warn if bands state other settings of the evaluation than a member has."""
+    for setting, attribute in ATTRIBUTES.items():
+        known = bands.settings.get(key := f"evaluation.{setting}")
+        other = [own for member in members if (own := getattr(member, attribute)) != known]
+        if known is not None and other:
+            log.warning(
+                "error bands promise nothing: the calibration had %s=%s, this rollout %s", key, str(known).lower(), str(other[0]).lower()
+            )

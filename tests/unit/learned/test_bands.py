@@ -264,6 +264,26 @@ def test_bands_of_other_frames_are_refused_and_of_other_levels_marked(checkpoint
     assert np.abs(repeated.trajectory.pos - exact.trajectory.pos).max() > 0
 
 
+@pytest.mark.parametrize(
+    ("setting", "changed", "text"),
+    [
+        ({"evaluation.mirror_average": True}, {"mirror_average": True}, "evaluation.mirror_average=true, this rollout false"),
+        ({"evaluation.clamp_parameters": False}, {"clamps_parameters": False}, "evaluation.clamp_parameters=false, this rollout true"),
+        ({"evaluation.static_friction": 0.9}, {}, "evaluation.static_friction=0.9, this rollout 0.0"),
+    ],
+)
+def test_bands_of_other_settings_are_warned_of(
+    setting: dict[str, Any], changed: dict[str, Any], text: str, checkpoint: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    single, own = LearnedSimulator.from_checkpoint(checkpoint), replace(of_frames(calibrated(19, checkpoint)), settings=setting)
+    start = replace(single.standing(state().to_torch(), metadata()), time=own.start_frame * metadata().frame_dt)
+    if changed:
+        roll_out_with_bands(single.configured(**changed), start, 1, metadata(), own)
+        assert "promise nothing" not in caplog.text
+    roll_out_with_bands(single, start, 1, metadata(), own)
+    assert f"error bands promise nothing: the calibration had {text}" in caplog.text
+
+
 def test_the_settings_of_a_rollout_are_those_that_differ_from_the_model(checkpoint: Path) -> None:
     simulator = LearnedSimulator.from_checkpoint(checkpoint)
     assert _other_settings(EvaluationSettings(), [simulator]) == {}
