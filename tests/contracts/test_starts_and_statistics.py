@@ -35,6 +35,15 @@ def alone(build: GraphBuilder, materials: tuple[str, ...], seed: int = 0) -> tup
     return state, graph
 
 
+@pytest.mark.parametrize("value", [0.0, float("nan")])
+def test_targets_that_teach_nothing_are_refused(value: float) -> None:
+    build = scenes.builder(history=1)
+    graph = build(scenes.state().to_torch())
+    graph["sand"].target = torch.full((40, 2), value)
+    with pytest.raises(ValueError, match="nothing to learn from"):
+        learned(build).fit_statistics([graph])
+
+
 def test_what_the_statistics_lack_is_named_once_and_never_silently_unscaled(caplog: pytest.LogCaptureFixture) -> None:
     build = scenes.builder(("sand", "snow"), history=1)
     simulator = learned(build).eval()

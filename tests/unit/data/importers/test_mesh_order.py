@@ -107,6 +107,13 @@ def test_a_folder_of_several_collections_is_no_trajectory(tmp_path: Path, files:
     assert not report.refusals and report.splits["train"].trajectories == 2
 
 
+def test_files_beside_the_folders_of_splits_are_named(tmp_path: Path) -> None:
+    write_xdmf(tmp_path / "raw" / "train")
+    write_xdmf(tmp_path / "raw")
+    settings = ImportSettings("meshio", str(tmp_path / "raw"), "set", holdout=0.0, arrays={"stress": "S"})
+    assert "1 files beside train/ were not read, the first is beam.xdmf" in " ".join(import_dataset(tmp_path / "data", settings).warnings)
+
+
 def test_a_folder_with_the_values_of_an_xdmf_file_is_no_trajectory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "raw" / "values").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "raw" / "values")  # where meshio writes the values
