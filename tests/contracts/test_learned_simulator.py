@@ -227,7 +227,7 @@ def test_a_contained_rollout_ends_inside_and_a_guarded_one_with_a_reason(traject
     assert free.termination is not None
     assert free.termination.reason == "escape"
     contained = Contained(simulator, trajectory.metadata.frame_dt)
-    counts: list[int] = []
+    counts: list[int | float] = []
     guard = Guard(bounds=trajectory.metadata.bounds, margin=1e-5)
     inside = rollout(contained, start, 50, trajectory.metadata, guard, lambda _, state: counts.append(state.num_corrected))
     assert inside.termination is None
