@@ -66,8 +66,9 @@ def test_controls_change_what_reads_the_parameter(embedding: str, controls: Mate
         assert own == errors(evaluate(learned, controls.root, replace(SETTINGS, material_controls=False), tmp_path / "plain"), "learned")
     for control in CONTROLS:
         other = errors(rows, label_of("learned", control))
-        assert len(other) == len(own) == 2 and not errors(rows, label_of("learned", control), "test")
-        if embedding == "none":
+        assert len(own) == 2 and len(other) == (0 if control == "shuffled" else 2)  # each group has one scene, so none has another's values
+        assert not errors(rows, label_of("learned", control), "test")
+        if embedding == "none" and other:
             assert other == own
     if embedding == "affine":
         nearest, far = (errors(rows, label_of("learned", control)) for control in ("nearest", "far"))
