@@ -123,8 +123,8 @@ def _in_order(files: list[Path]) -> list[Path]:
     """Return files in the order of the numbers in their names.
 
     Raises:
-        Refusal: names differ elsewhere than in one number, the order depends on whether ``0.1`` is a number with decimals or two numbers, or a number is
-            missing or occurs twice.
+        Refusal: names differ elsewhere than in numbers that rise together, the order depends on whether ``0.1`` is a number with decimals or two numbers, or a
+            number is missing or occurs twice.
     """
     ordered = sorted(files, key=lambda file: natural(file.name))
     if len(ordered) < 2:

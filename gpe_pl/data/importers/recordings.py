@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt64
 
 from gpe_pl.data.importers.source import Item
 from gpe_pl.geometry.periodicity import Periodicity
-from gpe_pl.trajectory.rest_positions import COARSE
+from gpe_pl.trajectory.rest_positions import coarse_axes, round_middle
 from gpe_pl.trajectory.trajectory import Trajectory
 
 NUM_FOLLOWED = 64
@@ -160,9 +160,5 @@ def _digest(pos: Float[np.ndarray, "node dim"]) -> np.uint64:
 def _origin(pos: Float[np.ndarray, "node dim"]) -> Float[np.ndarray, "dim"]:
     """Return a round point near the nodes if they are so far from 0 that float32 does not tell them apart, and 0 otherwise."""
     low, high = pos.min(axis=0).astype(np.float64), pos.max(axis=0).astype(np.float64)
-    width = float((high - low).max())
-    farthest = np.maximum(np.abs(low), np.abs(high))
-    if width == 0 or not (np.spacing(farthest.astype(np.float32)) > COARSE * width).any():
-        return np.zeros(len(low))
-    step = 10.0 ** np.ceil(np.log10(width))
-    return step * np.rint((low + high) / 2 / step)
+    nowhere = np.zeros(len(low))
+    return round_middle(low, high, nowhere) if (high > low).any() and coarse_axes(low, high).any() else nowhere
