@@ -34,9 +34,9 @@ from gpe_pl.data.importers.source import (
     Source,
     joined,
     natural,
-    split_folders,
     walls_at_bounds,
 )
+from gpe_pl.data.importers.split_places import split_folders
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.schema import MATERIALS
 from gpe_pl.trajectory.arrays import estimated_normals, flags, numbers

@@ -38,9 +38,9 @@ from gpe_pl.data.importers.source import (
     Source,
     build,
     natural,
-    split_folders,
     typed,
 )
+from gpe_pl.data.importers.split_places import split_folders
 from gpe_pl.schema import BOUNDARY, MATERIALS
 
 COMPONENTS = [0, 3, 5, 1, 4, 2]

@@ -33,8 +33,8 @@ from gpe_pl.data.importers.source import (
     Source,
     build,
     natural,
-    split_folders,
 )
+from gpe_pl.data.importers.split_places import split_folders
 from gpe_pl.files import regular_files
 from gpe_pl.files.hdf5_arrays import most_unpacked
 

@@ -40,8 +40,8 @@ from gpe_pl.data.importers.source import (
     Source,
     build,
     natural,
-    split_folders,
 )
+from gpe_pl.data.importers.split_places import split_folders
 from gpe_pl.files.hdf5_arrays import is_named
 from gpe_pl.geometry.shapes import Box
 from gpe_pl.trajectory.arrays import typical_spacing

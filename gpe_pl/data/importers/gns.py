@@ -41,9 +41,9 @@ from gpe_pl.data.importers.source import (
     length_warning,
     number,
     read_json,
-    split_files,
     typed,
 )
+from gpe_pl.data.importers.split_places import split_files
 from gpe_pl.files.hdf5_arrays import is_named
 
 TYPES = {0: "solid", 3: "boundary", 5: "fluid", 6: "sand", 7: "snow"}
@@ -57,7 +57,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     Raises:
         ImportFailure: there are no such files, one is damaged, or ``metadata.json`` lacks a value.
     """
-    files = split_files(path, (".tfrecord", ".npz", ".h5"))
+    files, warnings = split_files(path, (".tfrecord", ".npz", ".h5"))
     described = (path if path.is_dir() else path.parent) / "metadata.json"
     values = read_json(described)
     if "bounds" not in values and isinstance(values.get("train"), dict):  # newer files have separate values for training and rollout
@@ -77,7 +77,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         notes=tuple(notes),
     ).overridden(settings)
     length, dim = (count_in(values, key, described) for key in ("sequence_length", "dim"))
-    warnings = (
+    warnings += (
         () if dim in (None, len(bounds)) else (f"dim = {dim} in {described.name}, but bounds have {len(bounds)} axes, which were taken",)
     )
     readers = {".tfrecord": _in_records, ".npz": _in_archive, ".h5": _in_hdf5}

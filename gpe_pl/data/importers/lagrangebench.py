@@ -33,9 +33,9 @@ from gpe_pl.data.importers.source import (
     length_warning,
     number,
     read_json,
-    split_files,
     typed,
 )
+from gpe_pl.data.importers.split_places import split_files
 from gpe_pl.schema import STICKY
 
 PADDING = -1
@@ -51,7 +51,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     Raises:
         ImportFailure: there are no such files, one is damaged, or ``metadata.json`` lacks a value.
     """
-    files = split_files(path, (".h5",))
+    files, unread = split_files(path, (".h5",))
     folder = path if path.is_dir() else path.parent
     described = folder / "metadata.json"
     values = read_json(described)
@@ -118,4 +118,4 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     ]
     if values.get("dim", dim) != dim:
         warnings.append(f"dim = {values['dim']!r} in {described.name}, but bounds have {dim} axes, as the data must")
-    return Source(facts, splits, tuple(warnings))
+    return Source(facts, splits, (*unread, *warnings))

@@ -37,9 +37,9 @@ from gpe_pl.data.importers.source import (
     length_warning,
     number,
     read_json,
-    split_files,
     typed,
 )
+from gpe_pl.data.importers.split_places import split_files
 from gpe_pl.schema import BOUNDARY
 
 NORMAL, HANDLE = 0, 3
@@ -55,7 +55,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     Raises:
         ImportFailure: there are no such files, one is damaged, ``meta.json`` lacks a value, or the meshes do not move or change their nodes.
     """
-    files = split_files(path, (".tfrecord", ".h5"))
+    files, warnings = split_files(path, (".tfrecord", ".h5"))
     described = (path if path.is_dir() else path.parent) / "meta.json"
     meta = read_json(described)
     features = meta.get("features")
@@ -109,7 +109,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
             splits[split] = [Item(name, partial(from_group, file, name)) for name in hdf5.groups(file)]
         else:
             splits[split] = [Item(f"record {k}", partial(from_record, record)) for k, record in enumerate(tfrecord.records(file))]
-    return Source(facts, splits)
+    return Source(facts, splits, warnings)
 
 
 def _decoded(stored: tfrecord.Feature | None, name: str, feature: Mapping[str, Any], num_nodes: int | None = None) -> np.ndarray:

@@ -63,9 +63,9 @@ from gpe_pl.data.importers.source import (
     build,
     check_axes,
     natural,
-    split_folders,
     typed,
 )
+from gpe_pl.data.importers.split_places import split_folders
 from gpe_pl.errors.printable import did_you_mean
 from gpe_pl.geometry.periodicity import Periodicity
 from gpe_pl.schema import BOUNDARY, CELL_KINDS, MATERIALS

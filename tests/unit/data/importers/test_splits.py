@@ -82,3 +82,21 @@ def test_nor_for_a_damaged_split_of_the_source(tmp_path: Path) -> None:
     (source / "valid" / "0" / "0.h5").write_bytes(b"")
     with pytest.raises(ImportFailure, match="no trajectory of val can be used"):
         seeds(tmp_path, source)
+
+
+@pytest.mark.parametrize("format", ["gns", "lagrangebench", "meshgraphnets"])
+def test_files_that_are_of_no_split_are_named(tmp_path: Path, format: str) -> None:
+    source = tmp_path / "raw"
+    if format == "gns":
+        sources.gns_metadata(source, motion())
+        ending, write = ".tfrecord", lambda path: sources.gns_tfrecord(path, [(motion(seed=k), np.full(20, 6)) for k in range(3)])
+    elif format == "lagrangebench":
+        sources.lagrangebench_metadata(source, periodic_boundary_conditions=[False, False])
+        ending, write = ".h5", lambda path: sources.lagrangebench_h5(path, [(motion(seed=k), np.zeros(20, np.int64)) for k in range(3)])
+    else:
+        sources.mgn_meta(source, sources.sheet())
+        ending, write = ".h5", lambda path: sources.mgn_h5(path, [sources.sheet(seed=k) for k in range(3)])
+    for name in ("train", "train10", "train2", "._train"):
+        write(source / f"{name}{ending}")
+    report, _ = imported(tmp_path, source, format)
+    assert f"2 other files were not read, the first is train2{ending}: splits are train, valid" in report.text()
