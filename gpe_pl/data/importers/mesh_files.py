@@ -72,12 +72,15 @@ class Frame:
 
     @classmethod
     def of(cls, file: str, time: float | None, mesh: Any) -> Frame:
-        """Return the frame of a ``meshio.Mesh``; points of their own are cells to meshio and are left out.
+        """Return the frame of a ``meshio.Mesh``.
+
+        Points of their own are cells of kind ``vertex`` to meshio. Their values are values of the points if each point has one such cell.
 
         Raises:
             Refusal: a kind of cells is not known, or a cell names a point that the mesh lacks.
         """
         points = np.asarray(mesh.points, np.float64)
+        point_data = _of_vertices(mesh, len(points)) | {name: np.asarray(values) for name, values in mesh.point_data.items()}
         cells: dict[str, list[np.ndarray]] = {}
         data: dict[str, dict[str, list[np.ndarray]]] = {name: {} for name in mesh.cell_data}
         for k, block in enumerate(mesh.cells):
@@ -96,7 +99,16 @@ class Frame:
                     f"{file} has cells of kind {kind} with points {corners.min()} to {corners.max()}; there are {len(points)} points"
                 )
         cell_data = {name: {kind: np.concatenate(parts) for kind, parts in own.items()} for name, own in data.items()}
-        return cls(file, time, points, whole, {name: np.asarray(values) for name, values in mesh.point_data.items()}, cell_data)
+        return cls(file, time, points, whole, point_data, cell_data)
+
+
+def _of_vertices(mesh: Any, num_points: int) -> dict[str, np.ndarray]:
+    blocks = [k for k, block in enumerate(mesh.cells) if block.type == "vertex"]
+    points = np.concatenate([np.asarray(mesh.cells[k].data, np.int64).ravel() for k in blocks] or [np.zeros(0, np.int64)])
+    order = np.argsort(points)
+    if not num_points or not np.array_equal(points[order], np.arange(num_points)):
+        return {}
+    return {name: np.concatenate([np.asarray(values[k]) for k in blocks])[order] for name, values in mesh.cell_data.items()}
 
 
 def read_series(path: Path) -> list[Frame]:

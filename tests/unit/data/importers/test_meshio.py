@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset
+from gpe_pl.data.importers.mesh_files import Frame
 from gpe_pl.data.importers.meshes import mean_at_nodes, without_faces
 from gpe_pl.export.trajectories import write_vtk
 from gpe_pl.trajectory.store import iter_trajectories
@@ -233,6 +234,18 @@ def test_cells_of_the_surface_add_no_mass_and_no_stress(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.stress.node, 3.0)
     assert found.cells is not None and found.cells.tolist() == [[0, 1, 2, 3]] and found.cell_dim == 3
     assert "cells of kind triangle whose corners" in next((tmp_path / "data").rglob("report.json")).read_text()
+
+
+def test_values_of_vertices_are_values_of_their_points() -> None:
+    order = np.array([[2], [0], [3], [1]])
+    cells = [("vertex", order[:1]), ("line", [[0, 1]]), ("vertex", order[1:])]
+    values = 10.0 * order
+    data = {"mass": [values[:1], np.zeros((1, 1)), values[1:]], "speed": [np.zeros((n, 1)) for n in (1, 1, 3)]}
+    frame = Frame.of("a.vtu", 0.0, meshio.Mesh(FLAT[:4], cells, point_data={"speed": np.ones(4)}, cell_data=data))
+    assert frame.point_data["mass"].ravel().tolist() == [0, 10, 20, 30]
+    assert frame.point_data["speed"].tolist() == [1] * 4
+    some = meshio.Mesh(FLAT[:4], [("vertex", order[:3])], cell_data={"mass": [values[:3]]})
+    assert Frame.of("a.vtu", 0.0, some).point_data == {}
 
 
 def test_only_cells_that_belong_to_a_larger_one_are_left_out() -> None:
