@@ -77,7 +77,7 @@ class Predictor:
         controls: prepared controls of scenes with unseen parameters.
         stride: number of stored frames in a frame of the simulator.
         start_frame: frame at which rollouts start.
-        seconds: processor time per scene of each step so far [s].
+        seconds: computing time per scene of each step so far [s].
         bars: makes the progress bar of a split, which counts frames of the simulator's own rollouts.
     """
 
@@ -135,7 +135,7 @@ class Predictor:
             return Contained(inner, dt) if self.settings.containment else inner
 
         runner = combined(members, lambda member: within_walls(approximate(member)))
-        predicted = rollouts(Timed(runner, self.seconds), starts, see)
+        predicted = rollouts(Timed(runner, self.seconds, members[0].acceleration_std.is_cuda), starts, see)
         free = self._uncontained(combined(members, approximate), starts, numbers) if self.settings.containment else predicted
         is_exact = all(approximate(member) is member for member in members)
         exact = None if is_exact else rollouts(combined(members, within_walls), starts)

@@ -112,7 +112,7 @@ def evaluate(
             rows += see(scene, about) if see else []
             files.add(scene, about)
         files.finish()
-    write_cost(run_dir, predictor.seconds, frame_dt)
+    write_cost(run_dir, predictor.seconds, frame_dt, first.acceleration_std.is_cuda)
     write_rows(run_dir / "metrics.csv", rows)  # last, because a run with metrics counts as finished
     return rows
 

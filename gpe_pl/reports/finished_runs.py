@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from gpe_pl.evaluation.metric_rows import LEARNED, MetricsError, Row, read_rows
-from gpe_pl.evaluation.rollout_cost import read_cost
+from gpe_pl.evaluation.rollout_cost import Cost, read_cost
 from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, config_in
 from gpe_pl.reports import run_archive
 
@@ -39,7 +39,7 @@ class Run:
         rows: metrics: a table with the fields of ``evaluation.metric_rows.Row`` as columns.
         data: checksums of the data, by key of the configuration.
         curve: validation curve of an archived run; None if it is in the run's folder (see ``validation_curve``).
-        cost: processor time of rollouts per simulated second (see ``evaluation.rollout_cost``); None if it was not measured.
+        cost: computing time of rollouts; None if it was not measured.
     """
 
     folder: Path
@@ -47,7 +47,7 @@ class Run:
     rows: pd.DataFrame
     data: dict[str, str] = field(default_factory=dict)
     curve: Curve | None = None
-    cost: float | None = None
+    cost: Cost | None = None
 
 
 WITHOUT_CONSEQUENCE = {
@@ -72,7 +72,7 @@ def archive(runs: list[Run], root: Path, folder: Path) -> None:
         settings = {f"{CONFIG}{key}": value for key, value in run.config.items()} | {
             f"{DATA}{key}": value for key, value in run.data.items()
         }
-        settings |= {} if run.cost is None else {COST_KEY: run.cost}
+        settings |= {} if run.cost is None else {COST_KEY: run.cost.seconds, GPU_KEY: run.cost.on_gpu}
         about[run_name(run, root)] = settings | dict(zip(CURVE, (array.tolist() for array in validation_curve(run)), strict=True))
     run_archive.write_archive(folder, about, {run_name(run, root): run.rows for run in runs})
 
@@ -87,7 +87,9 @@ CONFIG, DATA = "config:", "data:"
 CURVE = ("validation_steps", "validation_losses")
 """Keys of an archive for the validation losses of a run and their training steps."""
 COST_KEY = "seconds_per_simulated_second"
-"""Key of an archive for the processor time of a run's rollouts per simulated second [s]."""
+"""Key of an archive for the computing time of a run's rollouts per simulated second [s]."""
+GPU_KEY = "rollouts_on_gpu"
+"""Key of an archive that tells whether the rollouts of a run were computed on a GPU."""
 
 
 def run_name(run: Run, root: Path) -> str:
@@ -101,7 +103,8 @@ def _archived(folder: Path) -> list[Run]:
     for name, known in about.items():
         config, data = ({key.removeprefix(kind): value for key, value in known.items() if key.startswith(kind)} for kind in (CONFIG, DATA))
         curve = np.array(known[CURVE[0]], int), np.array(known[CURVE[1]], float)
-        runs.append(Run(folder / name, config, rows[name], data, curve, known.get(COST_KEY)))
+        cost = Cost(known[COST_KEY], known.get(GPU_KEY, False)) if COST_KEY in known else None
+        runs.append(Run(folder / name, config, rows[name], data, curve, cost))
     return runs
 
 

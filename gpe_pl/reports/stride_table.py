@@ -24,8 +24,8 @@ DIFFERENT_STARTS = (
 )
 NOTE = (
     "Position MSE ×1e-3 [m²] at the instant, nodes and axes: median over trajectories and seeds, and the ratio of the means to the first row with its 95 % "
-    "bootstrap interval over paired trajectories that no row failed. Failed: rollouts that stopped early. Cost: processor time of rollout steps per simulated "
-    "second, measured in each run's evaluation, and its ratio to the first row. Edges: within the radius, per node, in the middle of the scenes."
+    "bootstrap interval over paired trajectories that no row failed. Failed: rollouts that stopped early. Cost: computing time of rollout steps per simulated "
+    "second, measured in each run's evaluation, and its ratio to the first row. It is processor time on a CPU and wall time on a GPU, which do not compare. Edges: within the radius, per node, in the middle of the scenes."
 )
 
 
@@ -92,5 +92,10 @@ def _cost(runs: list[Run], first: list[Run]) -> str:
     own, reference = ([run.cost for run in some if run.cost is not None] for some in (runs, first))
     if not own:
         return "not measured"
-    ratio = f" (×{np.mean(own) / np.mean(reference):.2f})" if reference and runs is not first else ""
-    return f"{np.mean(own):.3g}{ratio}"
+    clocks = {cost.on_gpu for cost in own}
+    if len(clocks) > 1:
+        return "on a CPU and on a GPU"
+    mean, reference_mean = (np.mean([cost.seconds for cost in costs]) if costs else np.nan for costs in (own, reference))
+    is_comparable = runs is not first and clocks == {cost.on_gpu for cost in reference}
+    ratio = f" (×{mean / reference_mean:.2f})" if is_comparable else ""
+    return f"{mean:.3g}{' on a GPU' if True in clocks else ''}{ratio}"

@@ -13,7 +13,7 @@ from gpe_pl.rollout.baselines import ConstantVelocity
 from gpe_pl.trajectory.trajectory import Trajectory
 
 
-def write_run(folder: Path, stride: int, errors: dict[str, list[float]], step: float | None, start_time: float | None = 0.1) -> None:
+def write_run(folder: Path, stride: int, errors: dict[str, list[float]], step: float | None, start_time: float | None = 0.1, on_gpu: bool = False) -> None:
     folder.mkdir(parents=True)
     config = {
         "seed": 0,
@@ -29,9 +29,8 @@ def write_run(folder: Path, stride: int, errors: dict[str, list[float]], step: f
     rows += [Row(LEARNED, "test", k, "seen", 20.0, "edges_per_node", "full", 10.0 * stride) for k in range(3)]
     write_rows(folder / "metrics.csv", rows)
     if step is not None:
-        write_cost(
-            folder, [9.0, *[step] * 19, *[0.5 * step, 1.5 * step] * 30], 0.005 * stride
-        )  # the first step compiles; others skip their work or do not
+        seconds = [9.0, *[step] * 19, *[0.5 * step, 1.5 * step] * 30]  # the first step compiles; others skip their work or do not
+        write_cost(folder, seconds, 0.005 * stride, on_gpu)
 
 
 def test_a_sweep_over_strides_has_a_table_of_instants_and_costs(tmp_path: Path) -> None:
@@ -58,6 +57,18 @@ def test_an_archive_keeps_the_costs(tmp_path: Path) -> None:
         sweep_table.report_sweep(tmp_path / folder, finished_runs(tmp_path / folder))
     tables = [(tmp_path / folder / "strides.md").read_text() for folder in ("runs", "kept")]
     assert tables[0] == tables[1] and "0.8" in tables[0]
+
+
+def test_costs_of_cpus_and_gpus_are_not_compared(tmp_path: Path) -> None:
+    for stride, on_gpu in ((1, False), (2, True), (4, False)):
+        write_run(tmp_path / "runs" / str(stride), stride, {"0.1s": [1e-3, 2e-3], "full": [1.0, 1.0]}, step=0.004, on_gpu=on_gpu)
+    runs = finished_runs(tmp_path / "runs")
+    (tmp_path / "kept").mkdir()
+    archive(runs, tmp_path / "runs", tmp_path / "kept")
+    for folder in ("runs", "kept"):
+        sweep_table.report_sweep(tmp_path / folder, finished_runs(tmp_path / folder))
+        costs = [line.split("|")[-3].strip() for line in (tmp_path / folder / "strides.md").read_text().splitlines()[2:5]]
+        assert costs == ["0.8", "0.4 on a GPU", "0.2 (×0.25)"]
 
 
 def test_rollouts_that_start_at_different_times_are_not_compared(tmp_path: Path) -> None:
