@@ -3,7 +3,7 @@ code: github.com/isl-org/DeepLagrangianFluids, ``models/default_torch.py``].
 
 Layers of the paper, with features f of particles and g of boundary nodes, ReLU φ, and channels 32, 64, 64, d::
 
-    f¹ = [conv(g), conv(f), dense(f)]            f^{k+1} = conv(φ(f^k)) + dense(φ(f^k)) (+ f^k where the widths agree)
+    f¹ = [conv([g, 1]), conv(f), dense(f)]       f^{k+1} = conv(φ(f^k)) + dense(φ(f^k)) (+ f^k where the widths agree)
 
 Filters have 4^d points and the radius of the graph. A particle is not a neighbour of itself; the dense layers process its own features.
 
@@ -13,6 +13,8 @@ Differences from the paper, because all models here share graphs, inputs and tar
   with gravity.
 - Particles have the standardised features of the graph (velocity history, gravity, material parameter) and one column per material. With one material this
   column is the constant 1 of the paper. Boundary nodes have velocity, normal and boundary condition; in the paper they have the normal only.
+- Boundary nodes also have the constant 1. Standardised features of the most common wall are about 0, and this layer has no other term: without the constant, it
+  would hardly see that wall, and not at all if features are the same for all walls.
 - All materials use the same filters. Edges connect all pairs within the radius, which is 4.5 particle radii in the paper.
 """
 
@@ -76,7 +78,7 @@ class ContinuousConvNet(Model):
         self.kernel_size = kernel_size
         self.particles = Homogeneous(spec, spec.materials, material_embedding)
         in_channels, first = self.particles.node_channels + self.particles.num_kinds, hidden_channels // 2
-        self.conv_boundary = ContinuousConv(spec.node_channels[BOUNDARY], first, spec.dim, kernel_size)
+        self.conv_boundary = ContinuousConv(spec.node_channels[BOUNDARY] + 1, first, spec.dim, kernel_size)
         self.conv_particles = ContinuousConv(in_channels, first, spec.dim, kernel_size)
         self.dense_particles = _dense(in_channels, first)
         widths = [3 * first, *[hidden_channels] * (num_convolutions - 2), spec.dim]
@@ -117,6 +119,7 @@ class ContinuousConvNet(Model):
         neighbors = (index, *interpolate(offset, self.kernel_size), n)
         at_boundary = (from_boundary, *interpolate(boundary_offset, self.kernel_size), n)
         boundary = x[BOUNDARY] if BOUNDARY in x else features.new_zeros(0, self.spec.node_channels[BOUNDARY])
+        boundary = functional.pad(boundary, (0, 1), value=1.0)
         parts = [self.conv_boundary(boundary, *at_boundary), self.conv_particles(features, *neighbors), self.dense_particles(features)]
         f = torch.cat(parts, dim=1)
         for conv, dense in zip(self.convs, self.denses, strict=True):

@@ -30,7 +30,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.testing import scenes
 from gpe_pl.learned.testing.changes import in_order, permuted, to_dtype, turned
 from gpe_pl.models.base import Model
-from gpe_pl.schema import FeatureSpec
+from gpe_pl.schema import BOUNDARY, FeatureSpec
 from gpe_pl.trajectory.state import State
 
 Factory = Callable[[FeatureSpec], Model]
@@ -176,6 +176,16 @@ def check_order_of_calls(make: Factory) -> None:
     _check_order_of_calls(make, scenes.builder(), scenes.state(), scenes.state(seed=7))
 
 
+def check_walls_without_features(make: Factory) -> None:
+    """Check that walls are seen if their standardised features are 0, as those of still walls that differ in nothing are."""
+    build = scenes.builder()
+    data, empty = (_graph(build, scenes.state(walls=walls)) for walls in (True, False))
+    data[BOUNDARY].x = torch.zeros_like(data[BOUNDARY].x)
+    model = make(build.spec)
+    with_walls, without = (predict(model, graph, 40) for graph in (data, empty))
+    assert float((with_walls - without).norm()) > 1e-6 * float(without.norm()), "walls whose features are 0 change no prediction"
+
+
 def check_features(make: Factory, features: str, history: int) -> None:
     """Check that the model takes its channel counts from the specification of the graphs."""
     build = scenes.builder(features=features, history=history)
@@ -231,6 +241,7 @@ CHECKS: dict[str, Check] = {
     "every parameter is used": check_every_parameter_is_used,
     "settings": check_settings,
     "order of calls": check_order_of_calls,
+    "walls without features": check_walls_without_features,
     **{f"features: {f}, history {h}": partial(check_features, features=f, history=h) for f in ("paper", "contact") for h in (1, 3)},
 }
 """Checks of all models by name."""

@@ -50,7 +50,8 @@ def published(model: Any, data: HeteroData) -> Tensor:
                 inside += [(a, b, -u), (b, a, u)]
 
     f, n, size = torch.stack(features), len(features), model.kernel_size
-    parts = [convolve(model.conv_boundary, data[BOUNDARY].x, outside, n, size), convolve(model.conv_particles, f, inside, n, size)]
+    g = torch.cat([data[BOUNDARY].x, torch.ones(len(data[BOUNDARY].x), 1, dtype=DOUBLE)], dim=1)
+    parts = [convolve(model.conv_boundary, g, outside, n, size), convolve(model.conv_particles, f, inside, n, size)]
     f = torch.cat([*parts, model.dense_particles(f)], dim=1)
     for conv, dense in zip(model.convs, model.denses, strict=True):
         active = torch.relu(f)
@@ -73,7 +74,7 @@ def test_equals_the_published_layers(materials: tuple[str, ...], dim: int) -> No
 
 
 def test_layers_are_those_of_the_paper() -> None:
-    """3D, inputs 1 and velocity, boundary normals, filters of 4³ points: 32 + 32 + 32, 64, 64 and 3 channels."""
+    """3D, inputs 1 and velocity, boundary normals and 1, filters of 4³ points: 32 + 32 + 32, 64, 64 and 3 channels."""
 
     def conv(channels: int, out: int) -> int:
         return 4**3 * channels * out + out
@@ -85,7 +86,7 @@ def test_layers_are_those_of_the_paper() -> None:
     spec = FeatureSpec(
         3, ("fluid",), {"fluid": 3, BOUNDARY: 3}, {"fluid": ()}, relations, dict.fromkeys(relations, 3), dict.fromkeys(relations, 0)
     )
-    first = conv(4, 32) + conv(3, 32) + dense(4, 32)
+    first = conv(4, 32) + conv(3 + 1, 32) + dense(4, 32)
     others = sum(conv(a, b) + dense(a, b) for a, b in ((96, 64), (64, 64), (64, 3)))
     assert sum(p.numel() for p in ContinuousConvNet(spec).parameters()) == first + others
 
