@@ -156,7 +156,7 @@ class FitRun:
         if self.training.budget_minutes is None:
             return
         checksum = self._checksums["train"] if self._settings["data"]["size"] == IMPORTED else None
-        key = step_time_key(self._settings, self.training, self.trainer, checksum)
+        key = step_time_key(self._settings, self._as_timed(self.training), self.trainer, checksum)
         times = self.runs / (self.cfg.reuse or self.cfg.name) / "step_times.json"
         self.callbacks.append(PauseForMeasurements(times))
         self.training = within_budget(self.training, times, key, self._step_time, self.device)
@@ -317,5 +317,10 @@ class FitRun:
                 train_only(simulator.model, [*simulator.model.early_layers(training.early_layers)], new.values())
         return TrainingModule(simulator, mean_neighbors=neighbors, **{name: getattr(training, name) for name in OPTIMISATION})
 
+    def _as_timed(self, training: TrainingSettings) -> TrainingSettings:
+        """Return settings for a measurement in this process, before other processes start: several processes train without CUDA graphs."""
+        return training if self.trainer.num_processes == 1 else replace(training, cuda_graph="off")
+
     def _step_time(self, training: TrainingSettings) -> float:
-        return mean_step_time(self._new_module(training).to(self.device), self._data.train_set, self.batch_size, training)
+        timed = self._as_timed(training)
+        return mean_step_time(self._new_module(timed).to(self.device), self._data.train_set, self.batch_size, timed)

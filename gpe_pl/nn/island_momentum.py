@@ -248,5 +248,7 @@ def _rotation(a: Tensor, m: Tensor, r: Tensor, label: Tensor, count: int) -> Ten
     moment = _sum(m * torch.linalg.cross(r, a), label, count)
     squares = r.square().sum(dim=1)[:, None, None] * torch.eye(3, dtype=r.dtype, device=r.device) - r[:, :, None] * r[:, None, :]
     inertia = _sum(m[:, :, None] * squares, label, count)
-    alpha = torch.linalg.pinv(inertia, rtol=SMALLEST_PRINCIPAL_FRACTION, hermitian=True) @ moment[:, :, None]
+    # in double precision, because a GPU may round the factors of products in single precision to TF32
+    inverse = torch.linalg.pinv(inertia.double(), rtol=SMALLEST_PRINCIPAL_FRACTION, hermitian=True)
+    alpha = (inverse @ moment.double()[:, :, None]).to(r.dtype)
     return torch.linalg.cross(alpha[label, :, 0], r)

@@ -33,9 +33,11 @@ class WarmAverage(WeightAveraging):
     """
 
     def __init__(self, decay: float = 0.999) -> None:
-        def average(averaged: list[torch.Tensor], current: list[torch.Tensor], num_averaged: Any) -> None:
+        def average(averaged: list[torch.Tensor], current: list[torch.Tensor], _: Any) -> None:
             if averaged[0].is_floating_point():  # all tensors of one call have the same type
-                torch._foreach_lerp_(averaged, current, self._weight_of_next(int(num_averaged)))
+                assert self._average_model is not None
+                number = int(self._average_model.n_averaged)  # on the CPU, so that a GPU does not have to wait
+                torch._foreach_lerp_(averaged, current, self._weight_of_next(number))
             else:
                 torch._foreach_copy_(averaged, current)
 
@@ -48,6 +50,11 @@ class WarmAverage(WeightAveraging):
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
             self._parameters = [*self._average_model.module.parameters()], [*pl_module.parameters()]
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Move the average to the device of the weights, which Lightning moves after ``setup``."""
+        if self._average_model is not None:
+            self._average_model.module.to(pl_module.device)
 
     def _swap_models(self, pl_module: L.LightningModule) -> None:
         """Swap weights and averages, and count this as a change of the weights, which compiled rollouts have to notice. Lightning copies past the count."""

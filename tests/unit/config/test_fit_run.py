@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -65,6 +66,19 @@ def test_another_precision_of_products_is_another_run_and_the_default_is_left_ou
     default, medium = trained(), trained("trainer.matmul_precision=medium")
     assert "trainer" not in default and trained("trainer.num_threads=2") == default
     assert medium == default | {"trainer": {"matmul_precision": "medium"}}
+
+
+@pytest.mark.parametrize(("processes", "expected"), [(1, "auto"), (2, "off")])
+def test_steps_of_several_processes_are_measured_without_cuda_graphs(
+    processes: int, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = FitRun(tiny(tmp_path / "data", tmp_path / "runs"), tmp_path / "run")
+    run.trainer, run.device, run._data, found = replace(run.trainer, devices=processes), "cpu", SimpleNamespace(train_set=None), []  # type: ignore[assignment]
+    monkeypatch.setattr(FitRun, "_new_module", lambda self, training: torch.nn.Identity())
+    monkeypatch.setattr(FitRun, "batch_size", 2, raising=False)
+    monkeypatch.setattr(fit_run, "mean_step_time", lambda module, data, size, training: float(found.append(training.cuda_graph) is None))
+    run._step_time(run.training)
+    assert (found, run.training.cuda_graph) == ([expected], "auto")
 
 
 @pytest.fixture

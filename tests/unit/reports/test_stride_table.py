@@ -13,7 +13,9 @@ from gpe_pl.rollout.baselines import ConstantVelocity
 from gpe_pl.trajectory.trajectory import Trajectory
 
 
-def write_run(folder: Path, stride: int, errors: dict[str, list[float]], step: float | None, start_time: float | None = 0.1, on_gpu: bool = False) -> None:
+def write_run(
+    folder: Path, stride: int, errors: dict[str, list[float]], step: float | None, start_time: float | None = 0.1, on_gpu: bool = False
+) -> None:
     folder.mkdir(parents=True)
     config = {
         "seed": 0,

@@ -245,6 +245,15 @@ def test_averaging_constant_weights_changes_nothing() -> None:
         assert torch.equal(value, before[key]), key
 
 
+def test_the_average_follows_the_weights_to_another_device() -> None:
+    model = Network()
+    callback = averaging(model, 0.999)
+    model.to("meta")  # Lightning moves the weights after ``setup``
+    callback.on_fit_start(L.Trainer(logger=False, enable_checkpointing=False), model)
+    assert callback._average_model is not None
+    assert {p.device.type for p in callback._average_model.module.parameters()} == {"meta"}
+
+
 def test_rollouts_during_a_validation_have_the_averaged_weights() -> None:
     m, callback = module(), WarmAverage(0.9)
     callback.setup(L.Trainer(logger=False, enable_checkpointing=False), m, "fit")
