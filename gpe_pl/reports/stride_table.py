@@ -25,7 +25,8 @@ DIFFERENT_STARTS = (
 NOTE = (
     "Position MSE ×1e-3 [m²] at the instant, nodes and axes: median over trajectories and seeds, and the ratio of the means to the first row with its 95 % "
     "bootstrap interval over paired trajectories that no row failed. Failed: rollouts that stopped early. Cost: computing time of rollout steps per simulated "
-    "second, measured in each run's evaluation, and its ratio to the first row. It is processor time on a CPU and wall time on a GPU, which do not compare. Edges: within the radius, per node, in the middle of the scenes."
+    "second, measured in each run's evaluation, and its ratio to the first row. It is processor time on a CPU and wall time on a GPU, which do not compare. "
+    "Edges: within the radius, per node, in the middle of the scenes."
 )
 
 

@@ -21,6 +21,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import StressError
 from gpe_pl.nn.elastic_bodies import CellError
+from gpe_pl.training.run import TrainingSettings
 from tests.runs import tiny
 
 
@@ -76,7 +77,12 @@ def test_steps_of_several_processes_are_measured_without_cuda_graphs(
     run.trainer, run.device, run._data, found = replace(run.trainer, devices=processes), "cpu", SimpleNamespace(train_set=None), []  # type: ignore[assignment]
     monkeypatch.setattr(FitRun, "_new_module", lambda self, training: torch.nn.Identity())
     monkeypatch.setattr(FitRun, "batch_size", 2, raising=False)
-    monkeypatch.setattr(fit_run, "mean_step_time", lambda module, data, size, training: float(found.append(training.cuda_graph) is None))
+
+    def measured(module: Any, data: Any, size: Any, training: TrainingSettings) -> float:
+        found.append(training.cuda_graph)
+        return 1.0
+
+    monkeypatch.setattr(fit_run, "mean_step_time", measured)
     run._step_time(run.training)
     assert (found, run.training.cuda_graph) == ([expected], "auto")
 
