@@ -163,6 +163,18 @@ def is_as_accurate(point: Point, solvers: Sequence[Point], horizon: str) -> bool
     return bool(best) and point.error(horizon) <= best[0].error(horizon)
 
 
+def speed_up(point: Point, solvers: Sequence[Point], horizon: str) -> float:
+    """Return the time of a solver of the same error over that of a model; above 1 the model is faster.
+
+    It is infinite if no solver has so small an error, 0 if a rollout failed, and NaN if the model is cheaper and less accurate than every solver. A model that
+    is less accurate and more expensive than the cheapest solver is compared with that one.
+    """
+    if not math.isfinite(point.error(horizon)):
+        return 0.0
+    ratio = cost_at_error(solvers, point.error(horizon), horizon) / point.cost
+    return ratio if ratio < 1 or is_as_accurate(point, solvers, horizon) else math.nan
+
+
 def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: float) -> float:
     """Return the number of rollouts of ``duration`` [s] after which the training of a model has paid off, compared with a solver of the same error.
 

@@ -21,6 +21,7 @@ from gpe_pl.benchmarks.cost_and_error import (
     is_below,
     paired_ratio,
     ratio_at_cost,
+    speed_up,
     winners,
 )
 from gpe_pl.benchmarks.solver_rungs import DATA, MODULI, NODES
@@ -45,9 +46,9 @@ def summary(cases: Mapping[str, Sequence[Point]]) -> str:
         learned = [p for p in points if p.family == "learned"]
         nearest = min(learned, key=lambda p: _mean_ratio(p, solvers))
         own = [h for h in horizons if h in nearest.mse]
-        slower = [_slower(nearest, solvers, h) for h in own]
+        faster = [speed_up(nearest, solvers, h) for h in own]
         cells = [_ratio(ratio_at_cost(nearest, solvers, h), len(nearest.mse[h])) if h in own else "–" for h in horizons]
-        lines.append(table_row([case, nearest.name, *cells, _times(slower), _verdict(nearest, solvers, own)]))
+        lines.append(table_row([case, nearest.name, *cells, _times(faster), _verdict(nearest, solvers, own)]))
     note = (
         "Error: that of the nearest model over that of a solver of the same cost, with its 95 % interval over paired scenes. Time: that of the model over that "
         "of a solver of the same error, at the horizons in this order; above 1 the model is slower, 0 means that no solver is as accurate, – that "
@@ -78,19 +79,9 @@ def _verdict(point: Point, solvers: Sequence[Point], horizons: Sequence[str]) ->
     return f"cheaper and less accurate than every solver at {apart} of {len(horizons)}" if apart else "level"
 
 
-def _slower(point: Point, solvers: Sequence[Point], horizon: str) -> float:
-    """Return the time of a model over that of a solver of at most the same error.
-
-    It is infinite if a rollout failed, and NaN if the model is cheaper and less accurate than every solver.
-    """
-    if not np.isfinite(point.error(horizon)):
-        return math.inf
-    ratio = point.cost / cost_at_error(solvers, point.error(horizon), horizon)
-    return ratio if ratio > 1 or is_as_accurate(point, solvers, horizon) else math.nan
-
-
-def _times(ratios: Sequence[float]) -> str:
-    return ", ".join("–" if math.isnan(ratio) else f"{ratio:.2g}" for ratio in ratios)
+def _times(faster: Sequence[float]) -> str:
+    """Return the times of a model over those of a solver of the same error, the reciprocals of ``speed_up``."""
+    return ", ".join("–" if math.isnan(ratio) else f"{1 / ratio if ratio else math.inf:.2g}" for ratio in faster)
 
 
 def section(case: str, comparison: Comparison, num_trajectories: int) -> str:

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from gpe_pl.benchmarks.cost_and_error import Comparison, Family, Point, break_even, cost_at_error, hypervolume, paired_ratio, ratio_at_cost
+from gpe_pl.benchmarks.cost_and_error import Comparison, Family, Point, break_even, hypervolume, paired_ratio, ratio_at_cost, speed_up
 from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
 from gpe_pl.benchmarks.ladder_tables import BALLISTIC, REPEATED, of_own_moduli, section, summary
 from gpe_pl.benchmarks.reference_solutions import REFERENCES, ComparisonError, observed_order, stored_reference
@@ -340,7 +340,7 @@ def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[
             }
         yield {"metric": "overhead", **about, "value": point.overhead, "unit": "s"}
         for horizon in point.mse if point.family == "learned" else ():
-            ratio = cost_at_error(solvers, point.error(horizon), horizon) / point.cost
+            ratio = speed_up(point, solvers, horizon)
             yield {"metric": "time_ratio_at_equal_error", **about, "horizon": horizon, "value": ratio, "unit": "1"}
             if (paired := ratio_at_cost(point, solvers, horizon)) is not None:
                 yield {"metric": "error_ratio_at_equal_time", **about, "horizon": horizon, **_of_interval(paired)}
@@ -372,8 +372,8 @@ def _of_interval(interval: Interval) -> dict[str, Any]:
     return {"value": interval.estimate, "low": interval.low, "high": interval.high, "unit": "1"}
 
 
-def _points(records: Sequence[dict[str, Any]], case: str) -> list[Point]:
-    """Read the points that ``_records`` wrote."""
+def points_of(records: Sequence[dict[str, Any]], case: str) -> list[Point]:
+    """Return cost and errors of each simulator of a case, from the records of ``results.json``."""
     points: dict[str, Point] = {}
     for r in records:
         if r["case"] == case and "simulator" in r:
@@ -395,7 +395,7 @@ def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
 
     found = {}
     for case in dict.fromkeys(r["case"] for r in records):
-        points = _points(records, case)
+        points = points_of(records, case)
         panels = {}
         for horizon in points[0].mse:
             lines: dict[str, list[tuple[float, float]]] = {

@@ -21,11 +21,12 @@ from gpe_pl.benchmarks.cost_and_error import (
     front,
     hypervolume,
     ratio_at_cost,
+    speed_up,
     winners,
 )
 from gpe_pl.benchmarks.ladder_tables import section, summary, verdicts
 from gpe_pl.benchmarks.reference_solutions import REFERENCES, ComparisonError, stored_reference
-from gpe_pl.benchmarks.runtime_vs_error import Entrant, Settings, _entrants, compare, figures, run
+from gpe_pl.benchmarks.runtime_vs_error import Entrant, Settings, _entrants, compare, figures, points_of, run
 from gpe_pl.benchmarks.solver_rungs import DATA, NODES
 from gpe_pl.benchmarks.spent_before import Simulated, Spent
 from gpe_pl.benchmarks.timed_rollouts import Start, distance, squared_error, timed
@@ -66,6 +67,15 @@ def test_equal_error_costs_what_lies_between_two_resolutions() -> None:
     assert cost_at_error(LADDER, 10**-3.5, "full") == pytest.approx(4.0)
     assert cost_at_error(LADDER, 1.0, "full") == 0.5
     assert cost_at_error(LADDER, 1e-5, "full") == float("inf")
+
+
+def test_a_model_is_faster_only_than_a_solver_of_its_error() -> None:
+    assert speed_up(point("model", 1.0, 1e-3, "learned"), LADDER, "full") == pytest.approx(2.0)
+    assert speed_up(point("slow", 4.0, 1e-3, "learned"), LADDER, "full") == pytest.approx(0.5)
+    assert speed_up(point("exact", 9.0, 1e-5, "learned"), LADDER, "full") == float("inf")
+    assert np.isnan(speed_up(point("careless", 0.1, 5e-2, "learned"), LADDER, "full"))
+    assert speed_up(point("slow and careless", 1.0, 5e-2, "learned"), LADDER, "full") == pytest.approx(0.5)
+    assert speed_up(point("failed", 0.1, float("inf"), "learned"), LADDER, "full") == 0.0
 
 
 def test_equal_cost_buys_what_lies_between_two_resolutions() -> None:
@@ -281,6 +291,9 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
     assert "order of convergence is 1.3" in table
     assert "| model | the same, moduli of the data |" in table and "keep the elastic moduli of the data, none would" in table
     assert "| medium |" in table and "| worse |" not in table and "Of the solvers, 1 are only in `results.json`" in table
+    ratio = {r["simulator"]: r["value"] for r in records if r["metric"] == "time_ratio_at_equal_error"}
+    assert ratio["model"] == pytest.approx(1.3, rel=0.1) and np.isnan(ratio["careless model"])
+    assert [(p.name, p.cost, p.mse) for p in points_of(records, "sand")] == [(p.name, p.cost, p.mse) for p in points]
     axes = figures(records)["cost_error_sand"].axes[0]
     labels = [
         "solver, coarser to the left",
