@@ -17,6 +17,10 @@ import nbformat
 import pytest
 from filelock import FileLock
 
+from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
+from gpe_pl.files import sealed
+from gpe_pl.learned.ensemble import LearnedEnsemble
+
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 MOMENTUM = ROOT / "notebooks" / "momentum_ablation.ipynb"
@@ -150,6 +154,30 @@ def _run_first_code(path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setenv("GPE_RUNS", str(runs))
     source = next(cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code")
     exec("\n".join(line for line in source.splitlines() if not line.startswith("%")), {})
+
+
+def _write_run(folder: Path, seed: int, **others: Any) -> None:
+    """Write the files of a finished run that notebooks read first. ``others`` are settings by group."""
+    folder.mkdir(parents=True)
+    config = {"data": {"name": "sand"}, "model": {"_target_": "gpe_pl.models.gpe.GPE"}, "training": {"num_steps": 10}}
+    settings = {name: config.get(name, {}) | others.get(name, {}) for name in {**config, **others}}
+    sealed.write(folder / "config.json", {"seed": seed, **settings})
+    write_rows(folder / "metrics.csv", [Row(LEARNED, "test_unseen", 0, "interpolated", 20.0, "rollout_mse", "full", 1.0)])
+
+
+def test_models_that_disagree_differ_in_nothing_but_the_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = list[list[str]]()
+    monkeypatch.setattr(LearnedEnsemble, "from_checkpoints", lambda folders: taken.append([folder.name for folder in folders]))
+    monkeypatch.setenv("GPE_NAME", "sweep")
+    active = ROOT / "notebooks" / "active.ipynb"
+    for name, seed, settings in (("a", 0, {"num_steps": 10}), ("b", 0, {"num_steps": 20}), ("c", 1, {"num_steps": 30})):
+        _write_run(tmp_path / "sweep" / name, seed, training=settings)
+    _write_run(tmp_path / "sweep" / "again", 0, training={"num_steps": 20})
+    with pytest.raises(FileNotFoundError, match="no two runs of one model with different seeds"):
+        _run_first_code(active, tmp_path, monkeypatch)
+    _write_run(tmp_path / "sweep" / "d", 2, training={"num_steps": 30})
+    _run_first_code(active, tmp_path, monkeypatch)
+    assert taken == [["c", "d"]]
 
 
 def test_momentum_ablation_without_results_says_how_to_make_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
