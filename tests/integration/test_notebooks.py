@@ -149,11 +149,16 @@ def test_unseen_materials_clamps_parameters_as_the_evaluation_of_its_runs_did(ex
     assert any(said in output.get("text", "") for output in _outputs(executed(ROOT / "notebooks" / "unseen_materials.ipynb")))
 
 
-def _run_first_code(path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Execute the first cell of code in this process, without the commands of IPython. A kernel would import everything again."""
-    monkeypatch.setenv("GPE_RUNS", str(runs))
+def _first_code(path: Path) -> str:
+    """Return the first cell of code without the commands of IPython."""
     source = next(cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code")
-    exec("\n".join(line for line in source.splitlines() if not line.startswith("%")), {})
+    return "\n".join(line for line in source.splitlines() if not line.startswith("%"))
+
+
+def _run_first_code(path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Execute the first cell of code in this process. A kernel would import everything again."""
+    monkeypatch.setenv("GPE_RUNS", str(runs))
+    exec(_first_code(path), {})
 
 
 def _write_run(folder: Path, seed: int, **others: Any) -> None:
@@ -178,6 +183,17 @@ def test_models_that_disagree_differ_in_nothing_but_the_seed(tmp_path: Path, mon
     _write_run(tmp_path / "sweep" / "d", 2, training={"num_steps": 30})
     _run_first_code(active, tmp_path, monkeypatch)
     assert taken == [["c", "d"]]
+
+
+def test_discs_of_own_data_stay_within_the_bounds_of_the_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GPE_WORK", str(tmp_path))
+    functions, _, _ = _first_code(ROOT / "notebooks" / "own_data.ipynb").partition("arrays =")
+    names: dict[str, Any] = {}
+    usual = "((0.0, 1.0), (0.0, 1.0))"
+    assert functions.count(usual) == 1
+    exec(functions.replace(usual, "((3.0, 4.0), (5.0, 6.0))"), names)
+    pos = names["discs"](0, num_discs=8, num_frames=60)
+    assert ((pos > (3.0, 5.0)) & (pos < (4.0, 6.0))).all()
 
 
 def test_momentum_ablation_without_results_says_how_to_make_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
