@@ -37,7 +37,7 @@ class Row:
         split: split of the data set.
         trajectory: number of the trajectory in the split; -1 for a metric of the whole split.
         parameter_group: one of ``GROUPS``.
-        parameter: first material parameter of the scene; NaN for a metric of the whole split.
+        parameter: first material parameter of the scene; NaN for a metric of the whole split, and for scenes whose nodes have several values.
         metric: name of the metric.
         horizon: label of the horizon; empty for metrics without one.
         value: value of the metric.

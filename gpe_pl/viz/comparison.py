@@ -69,14 +69,14 @@ def parameter_figure(
     """Draw median error over trajectories and seeds against the material parameter, a panel per domain; ticks at the bottom mark trained values.
 
     Args:
-        curves: errors by domain, model and parameter value.
+        curves: errors by domain, model and parameter value. Scenes without one value have NaN (``Row.parameter``) and are left out.
         seen: trained values by domain.
         label: label of the vertical axis.
         parameters: labels of the horizontal axes by domain.
         references: models with dashed or dotted grey lines.
 
     Raises:
-        ValueError: there are more models than can be told apart.
+        ValueError: there are more models than can be told apart, or no scene of a domain has one value.
     """
     figure = new_figure(TEXT_WIDTH, 2.4)
     figure.set_layout_engine("constrained")
@@ -84,12 +84,15 @@ def parameter_figure(
     models = list(dict.fromkeys(m for domain in curves.values() for m in domain))
     styles = curve_styles(len(models))
     for axes, (domain, by_model) in zip(panels, curves.items(), strict=True):
-        values = [p for points in by_model.values() for p in points]
+        given = [p for points in by_model.values() for p in points]
+        values = [p for p in given if np.isfinite(p)]
+        if given and not values:
+            raise ValueError(f"{domain}: no scene has one value of the parameter; nodes of several materials or values have none")
         axes.set_yscale("log")
         if values and min(values) > 0 and max(values) > 10 * min(values):
             axes.set_xscale("log")
         for k, model in enumerate(models):
-            points = sorted((p, float(np.median(v))) for p, v in by_model.get(model, {}).items())
+            points = sorted((p, float(np.median(v))) for p, v in by_model.get(model, {}).items() if np.isfinite(p))
             points = [p for p in points if np.isfinite(p[1])]
             color, dash = styles[k]
             style, color = (("s--", "d:")[references.index(model) % 2], "0.45") if model in references else (f"o{dash}", color)

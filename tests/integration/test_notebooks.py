@@ -192,8 +192,16 @@ def test_discs_of_own_data_stay_within_the_bounds_of_the_data_set(tmp_path: Path
     usual = "((0.0, 1.0), (0.0, 1.0))"
     assert functions.count(usual) == 1
     exec(functions.replace(usual, "((3.0, 4.0), (5.0, 6.0))"), names)
-    pos = names["discs"](0, num_discs=8, num_frames=60)
+    pos = names["discs"](0, num_discs=8, num_frames=30)
     assert ((pos > (3.0, 5.0)) & (pos < (4.0, 6.0))).all()
+
+
+def test_unseen_materials_refuses_scenes_of_several_materials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GPE_NAME", "sweep")
+    parameters = {name: {"seen": [20.0], "extrapolated": [10.0]} for name in ("sand", "snow")}
+    _write_run(tmp_path / "sweep" / "mixed", 0, data={"name": "mixed", "parameters": parameters}, size={"name": "tiny"})
+    with pytest.raises(ValueError, match=r"scenes of several materials \(sand, snow\), which have no one parameter.*GPE_NAME"):
+        _run_first_code(ROOT / "notebooks" / "unseen_materials.ipynb", tmp_path, monkeypatch)
 
 
 def test_momentum_ablation_without_results_says_how_to_make_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

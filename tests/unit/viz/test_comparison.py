@@ -40,6 +40,14 @@ def test_every_model_has_its_own_line() -> None:
         parameter_figure({"sand": {f"m{k}": {20.0: [1.0]} for k in range(29)}}, {}, "error")
 
 
+def test_scenes_without_one_parameter_are_left_out_of_the_figure() -> None:
+    nan = float("nan")
+    (axes,) = parameter_figure({"sand": {"GPE": {300.0: [2.0], nan: [5.0], 20.0: [1.0]}}}, {}, "error").axes
+    assert axes.lines[0].get_xdata().tolist() == [20.0, 300.0] and axes.get_xscale() == "log"
+    with pytest.raises(ValueError, match="mixed: no scene has one value of the parameter"):
+        parameter_figure({"mixed": {"GPE": {nan: [1.0]}, "GNS": {nan: [2.0]}}}, {}, "error")
+
+
 def test_coverage_below_the_usual_range_is_in_the_picture() -> None:
     bad = CoverageCurves(3, np.full((2, 4), 0.2), np.ones(4), np.ones(4))
     figure = coverage_figure({"seen": bad}, [0.5, 0.9], 0.9, 0.1, {2: "0.2 s", 3: "0.3 s"})
