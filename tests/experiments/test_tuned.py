@@ -84,6 +84,25 @@ def test_a_law_sets_model_graph_and_training_together(data: str, model: str, law
     )
 
 
+@pytest.mark.slow
+def test_the_law_of_elastomers_holds_beside_other_materials_too() -> None:
+    alone, mixed = (compose("fit", f"data={data}", "model=gpe_tuned", "law=elastic") for data in ("elastomer", "mixed"))
+    assert mixed.model == alone.model and mixed.training.loss == alone.training.loss
+    usual = compose("fit", "data=mixed", "model=gpe_tuned", "law=none").training
+    for key in ("velocity_noise_of_change", "push_fraction"):  # sand and snow need both
+        assert (mixed.training[key], alone.training[key]) == (usual[key], 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", [
+    ("recipe=paper", "model=gpe"), ("recipe=authors", "model=gns"), ("comparison=equal_time", "model=gpe_tuned", "size=tiny"),
+])  # fmt: skip
+def test_liquids_in_channels_have_the_values_of_liquids(settings: tuple[str, ...]) -> None:
+    closed, channel = (compose("fit", f"data={data}", *settings) for data in ("fluid", "channel"))
+    for key in ("training.velocity_noise_of_change", "training.position_noise_of_domain", "graph.connectivity_spacings"):
+        assert OmegaConf.select(closed, key) == OmegaConf.select(channel, key), key
+
+
 WITH_LAW = {"elastic_bodies", "fem_stress", "unseen_materials", "mixed_materials", "sand", "smoke", "few_shot_poisson"}
 """Experiments that leave the law of solids on, or adapt a shipped model that has it. All others compare models or parts of the network."""
 OF_PARTICLES = {"canyon", "scales"}
