@@ -67,6 +67,8 @@ def benchmark(cfg: DictConfig) -> None:
     values: Any = OmegaConf.to_container(cfg.suite, resolve=True)
     settings = construct(suite.Settings, {k: v for k, v in values.items() if k != "name"}, "suite")
     construct(TrainerSettings, cfg.trainer, "trainer")  # checks all keys, as suites use single values only
+    if cfg.trainer.accelerator == "gpu" and not hasattr(settings, "accelerator"):
+        raise ConfigError(f"trainer.accelerator=gpu: suite={cfg.suite.name} computes on the CPU; leave trainer=gpu out")
     if getattr(settings, "accelerator", "cpu") == "gpu" and not torch.cuda.is_available():
         raise ConfigError("trainer.accelerator=gpu: PyTorch finds no GPU here; choose trainer=cpu")
     keep_freed_memory()  # as trainings and evaluations do

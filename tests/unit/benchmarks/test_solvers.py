@@ -7,7 +7,6 @@ from omegaconf import OmegaConf
 
 from gpe_pl.benchmarks.solvers import BenchmarkError, Case, Settings, run, simulate
 from gpe_pl.config.datasets import dataset_spec
-from gpe_pl.config.folder import CONF
 from tests.runs import compose
 
 TINY = ["size=tiny", "data.sizes.tiny.num_train=3", "data.sizes.tiny.num_frames=5"]
@@ -15,8 +14,7 @@ TINY = ["size=tiny", "data.sizes.tiny.num_train=3", "data.sizes.tiny.num_frames=
 
 @pytest.mark.slow
 def test_every_configured_case_is_a_data_set():
-    suite: Any = OmegaConf.to_container(OmegaConf.load(CONF / "suite" / "solvers.yaml"))
-    cases = suite["cases"]
+    cases: Any = OmegaConf.to_container(compose("benchmark", "suite=solvers").suite.cases, resolve=True)
     assert {"sand", "snow", "elastomer", "fluid", "fem"} <= set(cases)
     specs = {label: dataset_spec(compose("simulate", *Case(**case).overrides)) for label, case in cases.items()}
     assert all(spec.size == "paper" and sum(spec.counts.values()) == 2700 for spec in specs.values())

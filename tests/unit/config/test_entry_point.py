@@ -20,7 +20,7 @@ from pydantic import Field
 
 from gpe_pl.benchmark import benchmark, without_folder
 from gpe_pl.config import entry_point as configuration
-from gpe_pl.config.datasets import dataset_spec, ensure_data
+from gpe_pl.config.datasets import dataset, dataset_spec, ensure_data
 from gpe_pl.config.entry_point import ConfigError, Report, bind, construct, entry_point, output_dir, quoted
 from gpe_pl.config.explanations import explain
 from gpe_pl.config.folder import CONF
@@ -482,3 +482,21 @@ def test_large_data_of_a_split_are_named_and_asked_for(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"fem_paper/paper: no data; .*gpe_pl\.simulate` and the data, parameters, ") as info:
         ensure_data(cfg)
     assert "data=fem_paper" not in str(info.value)
+
+
+def test_a_suite_that_computes_on_the_cpu_refuses_a_gpu(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    with pytest.raises(SystemExit):
+        call(monkeypatch, tmp_path, benchmark, "suite=stability", "trainer=gpu")
+    assert capsys.readouterr().err.startswith("error: trainer.accelerator=gpu: suite=stability computes on the CPU; leave trainer=gpu out")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suite", sorted(path.stem for path in (CONF / "suite").glob("*.yaml")))
+def test_the_size_of_a_benchmark_is_that_of_its_data_sets(suite: str) -> None:
+    by_size = [compose("benchmark", f"suite={suite}", f"size={size}").suite.get("cases", {}) for size in ("tiny", "small")]
+    for name in by_size[0]:
+        own, other = (dataset(*cases[name].overrides).size for cases in by_size)
+        assert (own, other) == ("tiny", "small"), name
