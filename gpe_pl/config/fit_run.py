@@ -152,7 +152,9 @@ class FitRun:
         self.device = set_up(self.trainer)
 
     def choose_num_steps(self) -> None:
-        """Replace a time budget by the number of steps that it allows."""
+        """Replace a time budget by the number of steps that it allows. A run of 0 steps trains nothing, so it has no use for a budget."""
+        if self.training.num_steps == 0:
+            self.training = replace(self.training, budget_minutes=None)
         if self.training.budget_minutes is None:
             return
         checksum = self._checksums["train"] if self._settings["data"]["size"] == IMPORTED else None

@@ -87,6 +87,13 @@ def test_steps_of_several_processes_are_measured_without_cuda_graphs(
     assert (found, run.training.cuda_graph) == ([expected], "auto")
 
 
+def test_a_run_of_no_steps_has_none_with_a_time_budget_too(tmp_path: Path) -> None:
+    run: Any = object.__new__(FitRun)
+    run.training = TrainingSettings(num_steps=0, budget_minutes=1.0)
+    run.choose_num_steps()
+    assert (run.training.num_steps, run.training.budget_minutes) == (0, None)
+
+
 @pytest.fixture
 def trained_elsewhere(tmp_path: Path) -> Path:
     """A checkpoint of a model that was trained with friction angles from 4° to 10°."""
