@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from gpe_pl.config.entry_point import LARGEST_INTEGER, ConfigError, compose, construct, construct_target
+from gpe_pl.config.typed_keys import TABLES
 from gpe_pl.files.names import data_name, spacing_suffix
 from gpe_pl.schema import SPLITS
 
@@ -30,8 +31,6 @@ IMPORTED = "imported"
 AUTOMATIC_BYTES = 2**30
 """``fit`` and ``evaluate`` generate data sets up to this size [bytes]. Generate larger ones with ``simulate``."""
 
-TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger", "comparison", "showcase", "split_name")
-"""Keys of ``data`` that only hold values for other keys, such as one for each size or dimension."""
 STRIDE = "stride"
 """Key of ``data`` with the number of stored frames in a frame of a model. It selects frames when data are read; stored data do not depend on it."""
 SPACING, SCALES = "spacing_factor", "scales"

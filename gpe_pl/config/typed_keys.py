@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gpe_pl.files.run_folder import LOOKUPS
+TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger", "comparison", "showcase", "split_name")
+"""Keys of ``data`` that only hold values for other keys, such as one for each size or dimension."""
 
-OF_SWEEPS = "size.comparison.seeds"
-"""Key that is read at the start of a sweep, not in its runs."""
+NOT_LOOKED_UP = ("suffix", "showcase")
+"""Keys in ``TABLES`` that are not only for other settings: a suffix is part of a name, and ``evaluate`` reads ``data.showcase`` itself."""
+
+AXES = "axes_of_the_sweep"
+"""Key of a copy of the configuration with what an experiment sweeps."""
 
 Condition = tuple[str, Callable[[Any], bool]]
 
@@ -42,24 +47,36 @@ UNREAD: dict[str, Condition | tuple[Condition, ...]] = {
 is always allowed, because it switches the setting off."""
 
 
-def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
+def without_effect(cfg: DictConfig, overrides: Sequence[str], axes: Mapping[str, Any] | None = None) -> str:
     """Describe the first override without an effect; empty if there is none.
 
     Args:
         cfg: composed configuration, unresolved.
         overrides: overrides ``KEY=VALUE`` from the command line or a sweep.
+        axes: values of each key that the experiment sweeps, unresolved.
     """
-    for override in overrides:
-        key, _, value = override.lstrip("+").partition("=")
-        if _is_in_lookup(key) and not key.startswith(OF_SWEEPS) and not _is_read(cfg, key):
+    for key, value in _leaves(overrides):
+        if _is_looked_up(key) and not _is_read(cfg, key, axes or {}):
             return f"{key}={value}: has no effect, because no other setting takes its value here; leave it out"
-        readers = [] if value == "0" else _conditions(key)
-        while readers:
-            reader, is_unread = readers.pop()
-            if is_unread(decides := OmegaConf.select(cfg, reader)):
-                return f"{key}={value}: has no effect with {reader}={'null' if decides is None else decides}; leave out one of the two"
-            readers += _conditions(reader)
+        if value != "0" and (reader := _unread_beside(cfg, key)):
+            decides = OmegaConf.select(cfg, reader)
+            return f"{key}={value}: has no effect with {reader}={'null' if decides is None else decides}; leave out one of the two"
     return ""
+
+
+def _leaves(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield key and value of each override, and of each entry of those that are tables."""
+
+    def entries(key: str, value: Any, text: str) -> Iterator[tuple[str, str]]:
+        if not (isinstance(value, dict) and value):
+            yield key, text
+            return
+        for name, each in value.items():
+            yield from entries(f"{key}.{name}", each, str(each))
+
+    for override, parsed in zip(overrides, OverridesParser.create().parse_overrides([*overrides]), strict=True):
+        if not parsed.is_delete():
+            yield from entries(parsed.key_or_group, parsed.value(), override.partition("=")[2])
 
 
 def _conditions(key: str) -> list[Condition]:
@@ -68,22 +85,49 @@ def _conditions(key: str) -> list[Condition]:
     return list(own) if not own or isinstance(own[0], tuple) else [own]
 
 
-def _is_in_lookup(key: str) -> bool:
-    """Whether a key belongs to a lookup table, or is one of the values of a size that other settings take."""
-    parts = key.split(".")
-    if len(parts) == 2 and parts[0] == "size":
-        return parts[1] not in ("name", *LOOKUPS)
-    return len(parts) > 2 and parts[0] in ("data", "size") and parts[1] in LOOKUPS
+def _unread_beside(cfg: DictConfig, key: str) -> str:
+    """Return the key whose value leaves this one unused; empty if it is used."""
+    readers = _conditions(key)
+    while readers:
+        reader, is_unread = readers.pop()
+        if is_unread(OmegaConf.select(cfg, reader)):
+            return reader
+        readers += _conditions(reader)
+    return ""
 
 
-def _is_read(cfg: DictConfig, key: str) -> bool:
-    """Whether another setting uses this entry. In that case, the configuration cannot be resolved without the entry."""
-    without = copy.deepcopy(cfg)
-    *table, entry = key.split(".")[:3]
-    OmegaConf.set_struct(without, False)
-    del OmegaConf.select(without, ".".join(table))[entry]
+def _is_looked_up(key: str) -> bool:
+    """Whether a key belongs to a table of values for other settings, or is one of the values of a size that other settings take."""
+    first, *rest = key.removeprefix("evaluation.").split(".")
+    if first == "size":
+        return rest[:1] not in ([], ["name"])
+    return first == "data" and rest[:1] != [] and rest[0] in TABLES and not {rest[0], rest[-1]} & {*NOT_LOOKED_UP}
+
+
+def _is_read(cfg: DictConfig, key: str, axes: Mapping[str, Any]) -> bool:
+    """Whether a used setting outside the tables takes this value. If so, it cannot be resolved where the value refers to a key that does not exist."""
+    probe = copy.deepcopy(cfg)
+    OmegaConf.set_struct(probe, False)
+    for unread in UNREAD:
+        if OmegaConf.select(cfg, unread.rpartition(".")[0] or unread) is not None and _unread_beside(cfg, unread):
+            OmegaConf.update(probe, unread, None)  # what only this setting takes is unused, too
+    OmegaConf.update(probe, key, "${no_such_key}")
+    OmegaConf.update(probe, AXES, dict(axes))
     try:
-        OmegaConf.resolve(without)
+        _resolve_settings(probe)
     except OmegaConfBaseException:
         return True
     return False
+
+
+def _resolve_settings(node: DictConfig, path: str = "") -> None:
+    """Resolve all values but those of tables."""
+    for name in list(node):
+        key = f"{path}{name}"
+        if _is_looked_up(key) or OmegaConf.is_missing(node, name):
+            continue
+        value = node[name]
+        if isinstance(value, DictConfig) and not OmegaConf.is_interpolation(node, name):
+            _resolve_settings(value, f"{key}.")
+        elif isinstance(value, (DictConfig, ListConfig)):
+            OmegaConf.to_container(value, resolve=True)

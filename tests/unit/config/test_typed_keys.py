@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import product
 from typing import Any
 
@@ -24,6 +25,11 @@ def unresolved(*overrides: str, hydra_config: bool = False) -> DictConfig:
         return hydra.compose("fit", [*overrides], return_hydra_config=hydra_config)
 
 
+def axes(*overrides: str) -> Any:
+    """What the experiment sweeps, unresolved."""
+    return OmegaConf.to_container(unresolved(*overrides, hydra_config=True).hydra.sweeper.params or OmegaConf.create({}))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("beside", "typed", "because"),
@@ -42,11 +48,31 @@ def unresolved(*overrides: str, hydra_config: bool = False) -> DictConfig:
         ("experiment=smoke", "size.num_steps=500", "no other setting"),
         ("model=cconv", "size.num_message_passing_steps=9", "no other setting"),
         ("model=gpe", "+size.channels=9", "no other setting"),
+        ("data=fluid", "data.sizes.tiny.d2.num_particles=9", "no other setting"),  # another dimension
+        ("data=fluid", "data.dimensions.d2.gravity=[0.0,-1.6]", "no other setting"),
+        ("data=fluid", "data.bounds.d2=[[0.0,2.0],[0.0,1.0]]", "no other setting"),
+        ("data=sand", "data.sizes.small.num_train=9", "no other setting"),  # another size
+        ("experiment=few_shot", "data.sizes.small.num_train=24", "no other setting"),  # the experiment has its own number
+        ("experiment=table1", "+evaluation.data.sizes.tiny.num_test_unseen=40", "no other setting"),
+        ("experiment=table1", "data.larger.scene.max_bodies=3", "no other setting"),
+        ("data=sand", "data.larger.scene.bounds=[[0,3],[0,1]]", "no other setting"),  # only other entries of the table take it
+        ("experiment=table1", "size.num_steps=9", "no other setting"),  # only training.num_steps takes it, which a time budget replaces
+        ("experiment=table1", "size={num_steps: 9}", "no other setting"),
+        ("experiment=table1", "training={num_steps: 9}", "training.budget_minutes=0.5"),
     ],
 )
 def test_what_nothing_reads_is_refused(beside: str, typed: str, because: str) -> None:
     refusal = without_effect(unresolved(beside, typed), [beside, typed])
-    assert refusal.startswith(f"{typed.lstrip('+')}: has no effect") and because in refusal
+    entry = re.sub(r"={(\w+): (.*)}", r".\1=\2", typed.lstrip("+"))  # of a table
+    assert refusal.startswith(f"{entry}: has no effect") and because in refusal
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("experiment", "is_read"), [("table1", True), ("ablation_momentum", False), ("few_shot", False), ("tuning", False)])
+def test_seeds_of_a_size_are_refused_where_no_axis_takes_them(experiment: str, is_read: bool) -> None:
+    typed = [f"experiment={experiment}", "size.comparison.seeds='0,1,2'"]
+    refusal = without_effect(unresolved(*typed), typed, axes(*typed))
+    assert (refusal == "") == is_read and (is_read or refusal.startswith(f"{typed[1]}: has no effect"))
 
 
 def test_what_only_unread_keys_read_is_refused() -> None:
@@ -62,8 +88,16 @@ def test_what_only_unread_keys_read_is_refused() -> None:
     [
         ("recipe=paper", "training.warmup_steps=0"),
         ("experiment=table1", "size.comparison.budget_minutes=3"),
-        ("experiment=table1", "size.comparison.seeds='0'"),
         ("experiment=larger_scenes", "data.larger.solver.bounds=[[0,3],[0,1]]"),
+        ("experiment=larger_scenes", "data.larger.scene.bounds=[[0,3],[0,1]]"),
+        ("experiment=larger_scenes", "data.larger.scene.max_bodies=3"),
+        ("experiment=larger_scenes", "data.sizes.tiny.larger_num_particles=99"),
+        ("data=fluid", "data.sizes.tiny.d3.num_particles=9"),
+        ("data=fluid", "data.dimensions.d3.gravity=[0.0,0.0,-1.6]"),
+        ("data=fluid", "data.bounds.d3=[[0,2],[0,1],[0,1]]"),
+        ("data=fluid", "data.default_dimension=2"),
+        ("data=sand", "data.variant=d3"),
+        ("data=fluid", "data.suffix=_mine"),
         ("model=gpe", "training.num_steps=77"),
         ("model=gpe", "size.num_steps=77"),
         ("model=gns", "size.hidden_channels=77"),
