@@ -1,4 +1,4 @@
-"""Check that every override has an effect. An override that the run would never read is refused."""
+"""Check that every override has an effect, and that it leaves the choices of a config group what they are. Other overrides are refused."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+
+from gpe_pl.config.folder import CONF
 
 TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger", "comparison", "showcase", "split_name")
 """Keys of ``data`` that only hold values for other keys, such as one for each size or dimension."""
@@ -48,14 +50,17 @@ is always allowed, because it switches the setting off."""
 
 
 def without_effect(cfg: DictConfig, overrides: Sequence[str], axes: Mapping[str, Any] | None = None) -> str:
-    """Describe the first override without an effect; empty if there is none.
+    """Describe the first override without an effect, or that changes what a swept choice is; empty if there is none.
 
     Args:
         cfg: composed configuration, unresolved.
         overrides: overrides ``KEY=VALUE`` from the command line or a sweep.
         axes: values of each key that the experiment sweeps, unresolved.
     """
-    for key, value in _leaves(overrides):
+    typed = dict(_leaves(overrides))
+    if message := _changes_a_choice(cfg, typed, axes or {}):
+        return message
+    for key, value in typed.items():
         if _is_looked_up(key) and not _is_read(cfg, key, axes or {}):
             return f"{key}={value}: has no effect, because no other setting takes its value here; leave it out"
         if value != "0" and (reader := _unread_beside(cfg, key)):
@@ -66,17 +71,45 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str], axes: Mapping[str,
 
 def _leaves(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Yield key and value of each override, and of each entry of those that are tables."""
-
-    def entries(key: str, value: Any, text: str) -> Iterator[tuple[str, str]]:
-        if not (isinstance(value, dict) and value):
-            yield key, text
-            return
-        for name, each in value.items():
-            yield from entries(f"{key}.{name}", each, str(each))
-
     for override, parsed in zip(overrides, OverridesParser.create().parse_overrides([*overrides]), strict=True):
         if not parsed.is_delete():
-            yield from entries(parsed.key_or_group, parsed.value(), override.partition("=")[2])
+            for key, value in _entries(parsed.value(), parsed.key_or_group):
+                yield key, override.partition("=")[2] if key == parsed.key_or_group else str(value)
+
+
+def _entries(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield keys and values of a nested table, or the value itself."""
+    if not (isinstance(value, dict) and value):
+        yield key, value
+        return
+    for name, each in value.items():
+        yield from _entries(each, f"{key}.{name}" if key else str(name))
+
+
+def _changes_a_choice(cfg: DictConfig, typed: Mapping[str, str], axes: Mapping[str, Any]) -> str:
+    """Describe the first override of a setting that makes a swept choice differ from others of its group; empty if there is none.
+
+    Choices of groups with a key of their own, such as ``model``, differ in more than single settings.
+    """
+    for group, choice in typed.items():
+        if group in cfg or group not in axes:
+            continue
+        own = _set_by(group, choice)
+        for key, value in typed.items():
+            if not (CONF / key).is_dir() and any(f"{key}.".startswith(f"{each}.") or each.startswith(f"{key}.") for each in own):
+                return f"{key}={value}: {group}={choice} sets this key itself, to differ from other choices; leave it out, or leave out this choice"
+    return ""
+
+
+def _set_by(group: str, choice: str) -> dict[str, Any]:
+    """Return the settings in the file of a choice, and in the files of its group that it builds on."""
+    if not (file := CONF / group / f"{choice}.yaml").is_file():
+        return {}
+    values: Any = OmegaConf.to_container(OmegaConf.load(file)) or {}
+    found: dict[str, Any] = {}
+    for base in values.pop("defaults", []):
+        found |= _set_by(group, base) if isinstance(base, str) else {}
+    return found | dict(_entries(values))
 
 
 def _conditions(key: str) -> list[Condition]:

@@ -68,6 +68,43 @@ def test_what_nothing_reads_is_refused(beside: str, typed: str, because: str) ->
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("experiment", "choice", "typed"),
+    [
+        ("few_shot", "adaptation=zero_shot", "training.num_steps=3000"),
+        ("few_shot", "adaptation=scratch", "start_from=mine"),
+        ("few_shot_poisson", "adaptation=scratch_five_times", "data.num_train=24"),
+        ("few_shot", "adaptation=whole", "training.early_layers=2"),
+        ("few_shot", "adaptation=early_layers", "training={early_layers: 2}"),
+        ("scales", "scaling=general", "graph.scales=dimensional"),
+        ("scales", "scaling=without_features", "data.scales=null"),
+        ("scales", "scaling=without_features", "data.scales={strides: [1]}"),  # which the file that it builds on sets
+        ("scales", "scaling=specialist", "data.spacing_factor=2"),
+    ],
+)
+def test_what_a_swept_choice_is_defined_by_cannot_be_typed(experiment: str, choice: str, typed: str) -> None:
+    overrides = [f"experiment={experiment}", choice, typed]
+    refusal = without_effect(unresolved(*overrides), overrides, axes(*overrides))
+    assert f": {choice} sets this key itself" in refusal and refusal.startswith(typed.partition("=")[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("experiment", "choice", "typed"),
+    [
+        ("few_shot", "adaptation=whole", "training.num_steps=3000"),  # which zero_shot sets
+        ("few_shot", "adaptation=early_layers", "start_from=mine"),
+        ("few_shot", "adaptation=scratch_five_times", "data=elastomer"),
+        ("table1", "model=gns", "model.hidden_channels=7"),  # a group with a key of its own
+        ("table1", "data=sand", "training.budget_minutes=3"),
+    ],
+)
+def test_what_a_swept_choice_leaves_open_can_be_typed(experiment: str, choice: str, typed: str) -> None:
+    overrides = [f"experiment={experiment}", choice, typed]
+    assert without_effect(unresolved(*overrides), overrides, axes(*overrides)) == ""
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("experiment", "is_read"), [("table1", True), ("ablation_momentum", False), ("few_shot", False), ("tuning", False)])
 def test_seeds_of_a_size_are_refused_where_no_axis_takes_them(experiment: str, is_read: bool) -> None:
     typed = [f"experiment={experiment}", "size.comparison.seeds='0,1,2'"]
