@@ -58,7 +58,7 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str], axes: Mapping[str,
         axes: values of each key that the experiment sweeps, unresolved.
     """
     typed = dict(_leaves(overrides))
-    if message := _changes_a_choice(cfg, typed, axes or {}):
+    if message := _switched_off(cfg, typed) or _changes_a_choice(cfg, typed, axes or {}):
         return message
     for key, value in typed.items():
         if _is_looked_up(key) and not _is_read(cfg, key, axes or {}):
@@ -73,17 +73,27 @@ def _leaves(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Yield key and value of each override, and of each entry of those that are tables."""
     for override, parsed in zip(overrides, OverridesParser.create().parse_overrides([*overrides]), strict=True):
         if not parsed.is_delete():
-            for key, value in _entries(parsed.value(), parsed.key_or_group):
+            for key, value in _entries({parsed.key_or_group: parsed.value()}):
                 yield key, override.partition("=")[2] if key == parsed.key_or_group else str(value)
 
 
-def _entries(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield keys and values of a nested table, or the value itself."""
-    if not (isinstance(value, dict) and value):
-        yield key, value
-        return
-    for name, each in value.items():
-        yield from _entries(each, f"{key}.{name}" if key else str(name))
+def _entries(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield keys and values of a nested table."""
+    for name, value in table.items():
+        if isinstance(value, dict) and value:
+            yield from _entries(value, f"{path}{name}.")
+        else:
+            yield f"{path}{name}", value
+
+
+def _switched_off(cfg: DictConfig, typed: Mapping[str, str]) -> str:
+    """Describe a typed law whose settings the recipe replaces, because recipes are composed later; empty if there is none."""
+    if {"law", "recipe"} - set(typed):
+        return ""
+    for key, value in _set_by("law", typed["law"]).items():
+        if key not in typed and (now := OmegaConf.select(cfg, key)) != value:
+            return f"law={typed['law']}: recipe={typed['recipe']} sets {key}={now} instead of {value}; leave out one of the two"
+    return ""
 
 
 def _changes_a_choice(cfg: DictConfig, typed: Mapping[str, str], axes: Mapping[str, Any]) -> str:

@@ -121,6 +121,22 @@ def test_what_only_unread_keys_read_is_refused() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("data=fem", "model=gpe_tuned", "law=elastic", "recipe=paper"), "law=elastic: recipe=paper sets graph.islands=False instead of True"),
+        (("data=elastomer", "model=gpe", "law=elastic", "recipe=paper"), "law=elastic: recipe=paper sets graph.islands=False instead of True"),
+        (("data=fem", "model=gpe_tuned", "law=none", "recipe=paper"), ""),
+        (("data=fem", "model=gpe_tuned", "law=elastic"), ""),
+        (("experiment=elastic_bodies", "recipe=paper"), ""),
+    ],
+)
+def test_a_typed_law_that_the_recipe_switches_off_is_refused(overrides: tuple[str, ...], message: str) -> None:
+    refusal = without_effect(unresolved(*overrides), overrides)
+    assert refusal.startswith(message) and bool(refusal) == bool(message)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
     ("beside", "typed"),
     [
         ("recipe=paper", "training.warmup_steps=0"),
