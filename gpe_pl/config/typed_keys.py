@@ -18,6 +18,9 @@ TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "boun
 NOT_LOOKED_UP = ("suffix", "showcase")
 """Keys in ``TABLES`` that are not only for other settings: a suffix is part of a name, and ``evaluate`` reads ``data.showcase`` itself."""
 
+SPACING = "data.spacing_factor"
+"""Key that is part of a name, and otherwise only for other settings."""
+
 AXES = "axes_of_the_sweep"
 """Key of a copy of the configuration with what an experiment sweeps."""
 
@@ -140,7 +143,9 @@ def _unread_beside(cfg: DictConfig, key: str) -> str:
 
 
 def _is_looked_up(key: str) -> bool:
-    """Whether a key belongs to a table of values for other settings, or is one of the values of a size that other settings take."""
+    """Whether a key belongs to a table of values for other settings, or is another value that only they take."""
+    if key == SPACING:
+        return True
     first, *rest = key.removeprefix("evaluation.").split(".")
     if first == "size":
         return rest[:1] not in ([], ["name"])
@@ -164,10 +169,10 @@ def _is_read(cfg: DictConfig, key: str, axes: Mapping[str, Any]) -> bool:
 
 
 def _resolve_settings(node: DictConfig, path: str = "") -> None:
-    """Resolve all values but those of tables."""
+    """Resolve all values but those of tables, and names, which are no settings."""
     for name in list(node):
         key = f"{path}{name}"
-        if _is_looked_up(key) or OmegaConf.is_missing(node, name):
+        if _is_looked_up(key) or name == "name" or OmegaConf.is_missing(node, name):
             continue
         value = node[name]
         if isinstance(value, DictConfig) and not OmegaConf.is_interpolation(node, name):

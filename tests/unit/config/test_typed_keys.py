@@ -58,6 +58,7 @@ def axes(*overrides: str) -> Any:
         ("data=sand", "data.larger.scene.bounds=[[0,3],[0,1]]", "no other setting"),  # only other entries of the table take it
         ("experiment=table1", "size.num_steps=9", "no other setting"),  # only training.num_steps takes it, which a time budget replaces
         ("experiment=table1", "size={num_steps: 9}", "no other setting"),
+        ("data.scene.grid_spacing=0.02", "data.spacing_factor=0.5", "no other setting"),  # only the name of the data would contain it
         ("experiment=table1", "training={num_steps: 9}", "training.budget_minutes=0.5"),
     ],
 )
@@ -150,6 +151,8 @@ def test_a_typed_law_that_the_recipe_switches_off_is_refused(overrides: tuple[st
         ("data=fluid", "data.bounds.d3=[[0,2],[0,1],[0,1]]"),
         ("data=fluid", "data.default_dimension=2"),
         ("data=sand", "data.variant=d3"),
+        ("data=sand", "data.spacing_factor=0.5"),
+        ("data.scene.grid_spacing=0.02", "+evaluation.data.spacing_factor=0.5"),  # half of the typed spacing
         ("data=fluid", "data.suffix=_mine"),
         ("model=gpe", "training.num_steps=77"),
         ("model=gpe", "size.num_steps=77"),
