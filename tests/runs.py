@@ -46,7 +46,8 @@ def compose(name: str, *overrides: str, hydra_config: bool = False) -> DictConfi
 
 def tiny(data: Path, runs: Path, *overrides: str) -> DictConfig:
     """Return the config of a run of two steps on the tiny data set."""
-    unread = ("size.comparison.budget_minutes=1e-5", "++data.sizes.tiny.larger_num_particles=60")  # by most experiments, which commands refuse
+    # Most experiments do not read these, so commands refuse them.
+    unread = ("size.comparison.budget_minutes=1e-5", "++data.sizes.tiny.larger_num_particles=60")
     return compose("fit", *DATA, *RUN, *unread, f"paths.data={data}", f"paths.runs={runs}", *overrides)
 
 

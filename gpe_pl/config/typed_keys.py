@@ -47,9 +47,15 @@ UNREAD: dict[str, Condition | tuple[Condition, ...]] = {
     "model.viscous": ("model.elastic", lambda elastic: elastic is False),
     "graph.num_levels": ("graph.mesh", lambda mesh: not mesh),
     "dimension": ("data.size", lambda size: size == "imported"),
+    "data.scales": ("graph.scales", lambda scales: scales is None),  # fit has this key, and simulate and evaluate do not
+    "evaluation.num_uncontained": ("evaluation.containment", lambda containment: containment is False),
+    "rollout.rest_step_spacings": ("rollout.sleep_after", lambda frames: frames is None),
+    "rollout.rest_step_change_spacings": ("rollout.sleep_after", lambda frames: frames is None),
+    "active.num_candidates": ("active.models", lambda models: models is None),
+    "active.horizon": ("active.models", lambda models: models is None),
 }
-"""Keys that are unused for some values of other keys, with each of these keys and the test of its value. They are also unused where such a key is. The value 0
-is always allowed, because it switches the setting off."""
+"""Keys that are unused, with all their entries, for some values of other keys. Each comes with these keys and the tests of their values, which are None for
+keys that the command does not have. Keys are also unused where such a key is. The value 0 is always allowed, because it switches the setting off."""
 
 
 def without_effect(cfg: DictConfig, overrides: Sequence[str], axes: Mapping[str, Any] | None = None) -> str:
@@ -67,6 +73,8 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str], axes: Mapping[str,
         if _is_looked_up(key) and not _is_read(cfg, key, axes or {}):
             return f"{key}={value}: has no effect, because no other setting takes its value here; leave it out"
         if value != "0" and (reader := _unread_beside(cfg, key)):
+            if OmegaConf.select(cfg, reader.partition(".")[0]) is None:
+                return f"{key}={value}: has no effect, because this command has no {reader}; leave it out"
             decides = OmegaConf.select(cfg, reader)
             return f"{key}={value}: has no effect with {reader}={'null' if decides is None else decides}; leave out one of the two"
     return ""
@@ -127,7 +135,7 @@ def _set_by(group: str, choice: str) -> dict[str, Any]:
 
 def _conditions(key: str) -> list[Condition]:
     """Return the conditions under which a key is unused."""
-    own: Any = UNREAD.get(key, ())
+    own: Any = UNREAD.get(key) or next((found for table, found in UNREAD.items() if key.startswith(f"{table}.")), ())
     return list(own) if not own or isinstance(own[0], tuple) else [own]
 
 

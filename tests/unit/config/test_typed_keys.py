@@ -19,10 +19,10 @@ from gpe_pl.files.run_folder import without_tables
 EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml") if p.stem != "search")  # that proposes its values while it runs
 
 
-def unresolved(*overrides: str, hydra_config: bool = False) -> DictConfig:
+def unresolved(*overrides: str, hydra_config: bool = False, command: str = "fit") -> DictConfig:
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return hydra.compose("fit", [*overrides], return_hydra_config=hydra_config)
+        return hydra.compose(command, [*overrides], return_hydra_config=hydra_config)
 
 
 def axes(*overrides: str) -> Any:
@@ -106,11 +106,34 @@ def test_what_a_swept_choice_leaves_open_can_be_typed(experiment: str, choice: s
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("experiment", "is_read"), [("table1", True), ("ablation_momentum", False), ("few_shot", False), ("tuning", False)])
+@pytest.mark.parametrize(
+    ("experiment", "is_read"), [("table1", True), ("ablation_momentum", False), ("few_shot", False), ("tuning", False)]
+)
 def test_seeds_of_a_size_are_refused_where_no_axis_takes_them(experiment: str, is_read: bool) -> None:
     typed = [f"experiment={experiment}", "size.comparison.seeds='0,1,2'"]
     refusal = without_effect(unresolved(*typed), typed, axes(*typed))
     assert (refusal == "") == is_read and (is_read or refusal.startswith(f"{typed[1]}: has no effect"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "beside", "typed", "because"),
+    [
+        ("fit", "evaluation.containment=false", "evaluation.num_uncontained=3", "with evaluation.containment=False"),
+        ("fit", "data=sand", "data.scales={strides: [1]}", ""),
+        ("evaluate", "data=sand", "data.scales={strides: [1]}", "because this command has no graph.scales"),
+        ("simulate", "data=sand", "data.scales={strides: [1]}", "because this command has no graph.scales"),
+        ("evaluate", "data=sand", "rollout.rest_step_spacings=0.5", "with rollout.sleep_after=null"),
+        ("evaluate", "data=sand", "rollout.rest_step_change_spacings=0.5", "with rollout.sleep_after=null"),
+        ("evaluate", "rollout.sleep_after=9", "rollout.rest_step_spacings=0.5", ""),
+        ("simulate", "data=sand", "active.num_candidates=50", "with active.models=null"),
+        ("simulate", "data=sand", "active.horizon=0.1", "with active.models=null"),
+        ("simulate", "active.models=[a,b]", "active.horizon=0.1", ""),
+    ],
+)
+def test_what_a_switched_off_part_of_a_command_would_read_is_refused(command: str, beside: str, typed: str, because: str) -> None:
+    refusal = without_effect(unresolved(beside, typed, command=command), [beside, typed])
+    assert because in refusal and refusal.startswith(typed.partition("=")[0] if because else "") and bool(refusal) == bool(because)
 
 
 def test_what_only_unread_keys_read_is_refused() -> None:
@@ -124,8 +147,14 @@ def test_what_only_unread_keys_read_is_refused() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("data=fem", "model=gpe_tuned", "law=elastic", "recipe=paper"), "law=elastic: recipe=paper sets graph.islands=False instead of True"),
-        (("data=elastomer", "model=gpe", "law=elastic", "recipe=paper"), "law=elastic: recipe=paper sets graph.islands=False instead of True"),
+        (
+            ("data=fem", "model=gpe_tuned", "law=elastic", "recipe=paper"),
+            "law=elastic: recipe=paper sets graph.islands=False instead of True",
+        ),
+        (
+            ("data=elastomer", "model=gpe", "law=elastic", "recipe=paper"),
+            "law=elastic: recipe=paper sets graph.islands=False instead of True",
+        ),
         (("data=fem", "model=gpe_tuned", "law=none", "recipe=paper"), ""),
         (("data=fem", "model=gpe_tuned", "law=elastic"), ""),
         (("experiment=elastic_bodies", "recipe=paper"), ""),
