@@ -12,11 +12,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gpe_pl.config.folder import CONF
 
-TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger", "comparison", "showcase", "split_name")
+TABLES = (
+    *("sizes", "dimensions", "default_dimension", "variant", "base_name", "suffix"),
+    *("bounds", "larger", "comparison", "showcase", "split_name"),
+)
 """Keys of ``data`` that only hold values for other keys, such as one for each size or dimension."""
 
-NOT_LOOKED_UP = ("suffix", "showcase")
-"""Keys in ``TABLES`` that are not only for other settings: a suffix is part of a name, and ``evaluate`` reads ``data.showcase`` itself."""
+NOT_LOOKED_UP = ("base_name", "suffix", "showcase")
+"""Keys in ``TABLES`` that are not only for other settings: parts of names, and ``data.showcase``, which ``evaluate`` reads itself."""
 
 SPACING = "data.spacing_factor"
 """Key that is part of a name, and otherwise only for other settings."""

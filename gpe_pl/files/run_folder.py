@@ -25,8 +25,8 @@ RUN_ID = "run_id"
 """File in a run folder with the identifier of the run in W&B. A resumed run continues under it."""
 LOGGED = (LOGS, TENSORBOARD, RUN_ID)
 """What a training writes before it has results."""
-LOOKUPS = ("comparison", "larger")
-"""Lookup tables of ``data`` and ``size`` from which other configuration keys take their values."""
+LOOKUPS = ("comparison", "larger", "base_name")
+"""Keys of ``data`` and ``size`` from which other configuration keys take their values, and which are not stored."""
 
 
 class RunError(GpeError, RuntimeError):

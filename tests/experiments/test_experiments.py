@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from gpe_pl.config.datasets import scene_metadata
+from gpe_pl.config.datasets import evaluated_config, scene_metadata
 from gpe_pl.config.fit_run import FitRun
 from gpe_pl.config.folder import CONF
 from gpe_pl.evaluation.metric_rows import read_rows
@@ -54,6 +54,23 @@ def test_there_are_experiments() -> None:
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_an_experiment_states_its_own_name(experiment: str) -> None:
     assert compose("fit", f"experiment={experiment}").name == experiment
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("overrides", "trained", "evaluated"),
+    [
+        (["experiment=few_shot"], "snow_few_12", "snow_few"),
+        (["experiment=few_shot", "data=elastomer"], "elastomer_few_12", "elastomer_few"),
+        (["experiment=few_shot", "data=fem", "adaptation=scratch_five_times"], "fem_few_60", "fem_few"),
+        (["experiment=few_shot_poisson"], "elastomer_few_12", "elastomer_few"),
+        (["experiment=scales", "scaling=general"], "sand_scales", "sand_scales"),
+        (["experiment=scales", "data=snow", "scaling=specialist", "evaluation.data.spacing_factor=2.0"], *["snow_scales_spacing_2"] * 2),
+    ],
+)
+def test_sets_of_an_experiment_are_named_after_their_data(overrides: list[str], trained: str, evaluated: str) -> None:
+    cfg = compose("fit", *overrides)
+    assert (cfg.data.name, evaluated_config(cfg).data.name) == (trained, evaluated)
 
 
 @pytest.mark.slow
