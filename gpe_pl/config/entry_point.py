@@ -33,7 +33,7 @@ from gpe_pl.config import plugins
 from gpe_pl.config.explanations import ConfigError, check_arguments, explain, groups, refusal, violations
 from gpe_pl.config.folder import CONF
 from gpe_pl.config.launcher import RESULT, USAGE_ERROR, SweepError, end_with_sweep
-from gpe_pl.config.typed_keys import without_effect
+from gpe_pl.config.typed_keys import axes_of, without_effect
 from gpe_pl.errors import GpeError
 from gpe_pl.errors.printable import clean_messages, did_you_mean, one_line, speak_utf8
 from gpe_pl.files.atomic import replace_text, unnamed
@@ -182,7 +182,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                 if "dimension" in list(cfg) and cfg.dimension not in (2, 3):
                     raise ConfigError(f"dimension={cfg.dimension}: must be 2 or 3")
                 typed = HydraConfig.get().overrides.task
-                if unread := without_effect(cfg, typed, _axes(HydraConfig.get())):
+                if unread := without_effect(cfg, typed, axes_of(HydraConfig.get())):
                     raise ConfigError(unread)
                 OmegaConf.resolve(cfg)
                 _check_device(cfg, typed)
@@ -298,11 +298,6 @@ def _fail(error: Exception) -> None:
     with contextlib.suppress(OSError):  # the standard error may be a file on a full disk
         print(f"error: {one_line(str(error))}", file=sys.stderr)
     sys.exit(USAGE_ERROR if RESULT in os.environ and isinstance(error, (ConfigError, NameRefused)) else 2)
-
-
-def _axes(hydra_config: Any) -> Any:
-    """Return the values of each key that the experiment sweeps, unresolved."""
-    return OmegaConf.to_container(OmegaConf.select(hydra_config, "sweeper.params") or OmegaConf.create({}))
 
 
 def _check_device(cfg: DictConfig, typed: Sequence[str]) -> None:

@@ -32,6 +32,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from gpe_pl.config.typed_keys import axes_of, without_effect
 from gpe_pl.errors import GpeError
 from gpe_pl.errors.printable import one_line
 from gpe_pl.files.run_folder import RunError, refuse_links
@@ -159,7 +160,8 @@ class CommandLauncher(Launcher):
             The results of the jobs in order. A failed job has a ``SweepError`` about all failures, which is raised when its value is accessed.
 
         Raises:
-            UsageError: two runs have the same folder, or the configuration of a run is wrong; the remaining jobs are not run.
+            UsageError: two runs have the same folder, or the configuration of a run is wrong; the remaining jobs are not run. Overrides that a run refuses
+                as in ``without_effect`` are found before the first run.
             SweepError: the sweep was interrupted.
         """
         from rich.console import Console
@@ -205,6 +207,9 @@ class CommandLauncher(Launcher):
         with open_dict(config):
             config.hydra.job.id = config.hydra.job.num = number
         HydraConfig.instance().set_config(config)  # the folder's name is resolved with it
+        task: Any = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+        if refused := without_effect(task, overrides, axes_of(config.hydra)):
+            raise UsageError(refused)
         settings = (f"~{REPORT}",) if OmegaConf.select(config, REPORT) is not None else ()
         return Job(list(overrides), Path(str(config.hydra.sweep.dir)), str(config.hydra.sweep.subdir), settings=settings)
 

@@ -83,6 +83,12 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str], axes: Mapping[str,
     return ""
 
 
+def axes_of(hydra_config: Any) -> dict[str, Any]:
+    """Return the values of each key that the experiment sweeps, unresolved, from Hydra's own settings."""
+    found: Any = OmegaConf.to_container(OmegaConf.select(hydra_config, "sweeper.params") or OmegaConf.create({}))
+    return found  # type: ignore[no-any-return]
+
+
 def _leaves(overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Yield key and value of each override, and of each entry of those that are tables."""
     for override, parsed in zip(overrides, OverridesParser.create().parse_overrides([*overrides]), strict=True):

@@ -45,6 +45,21 @@ def test_failures_are_named_and_the_others_run_and_a_rerun_finishes_them(tiny_da
     assert (tmp_path / "sweep" / "table.md").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["experiment=few_shot", "training.num_steps=3000"], "training.num_steps=3000: adaptation=zero_shot sets this key itself"),
+        (["experiment=tuning", "size.comparison.seeds='0,1,2'"], "size.comparison.seeds='0,1,2': has no effect"),
+    ],
+)
+def test_what_some_run_would_refuse_is_refused_before_the_first_run(overrides: list[str], message: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "gpe_pl.fit", *overrides, f"paths.data={tmp_path}", f"paths.runs={tmp_path}"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert result.returncode == 2 and result.stderr.startswith(f"error: {message}")
+    assert not [*tmp_path.rglob("output.log")]
+
+
 @pytest.mark.long
 def test_a_wrong_configuration_is_said_once(tiny_data: Path, tmp_path: Path) -> None:
     result = sweep(tiny_data, tmp_path, "training.learning_rate=-1", "seed=0,1,2,3")

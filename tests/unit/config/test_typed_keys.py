@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import gpe_pl.config.entry_point  # noqa: F401 registers plugins and resolvers that files in conf/ use
 from gpe_pl.config.folder import CONF
-from gpe_pl.config.typed_keys import without_effect
+from gpe_pl.config.typed_keys import axes_of, without_effect
 from gpe_pl.files.run_folder import without_tables
 
 EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml") if p.stem != "search")  # that proposes its values while it runs
@@ -27,7 +27,7 @@ def unresolved(*overrides: str, hydra_config: bool = False, command: str = "fit"
 
 def axes(*overrides: str) -> Any:
     """What the experiment sweeps, unresolved."""
-    return OmegaConf.to_container(unresolved(*overrides, hydra_config=True).hydra.sweeper.params or OmegaConf.create({}))
+    return axes_of(unresolved(*overrides, hydra_config=True).hydra)
 
 
 @pytest.mark.slow
