@@ -21,8 +21,8 @@ class Differentiable(Batched):
     simulator: LearnedSimulator
 
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        simulator, metadata = self.simulator, self.simulator.builder.metadata
+        simulator = self.simulator
         if not simulator.mirror_average:
             return simulator.next_states(states)
-        average = MirrorAverage(metadata.bounds, metadata.frame_dt)  # kept images would have no gradients, or those of another step
+        average = MirrorAverage.of(simulator.builder, simulator.model)  # kept images would have no gradients, or those of another step
         return average.next_states(simulator.next_states, states)

@@ -13,6 +13,8 @@ from typing import Any
 
 import torch
 
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.models.base import Model
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.reflection import Reflection, level_axes
@@ -30,11 +32,18 @@ class MirrorAverage:
     Attributes:
         bounds: ``(low, high)`` of the domain per axis [m]. The images are mirrored at its middle.
         dt: frame interval [s].
+        reads_shapes: whether the model reads the shapes of walls. Scenes with a shape that has no image (``geometry.shape_images``) then have an error.
     """
 
     bounds: Sequence[tuple[float, float]]
     dt: float
+    reads_shapes: bool = False
     _images: dict[tuple[int, tuple[Reflection, ...]], tuple[Boundary, list[Boundary]]] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, builder: GraphBuilder, model: Model) -> MirrorAverage:
+        """Return the average for a model and the builder of its graphs. Models with the elastic law read shapes."""
+        return cls(builder.metadata.bounds, builder.metadata.frame_dt, bool(model.settings.get("elastic")))
 
     def next_states(
         self, next_states: Callable[[list[State]], list[State | SimulationError]], states: list[State]
@@ -80,6 +89,12 @@ class MirrorAverage:
             return state
         if error := next((image for _, image in images if isinstance(image, SimulationError)), None):
             return error
+        if self.reads_shapes and before.boundary.shapes and not images[0][1].boundary.shapes:
+            kind = next(shape.kind for shape in before.boundary.shapes if not images[0][0].shapes([shape]))
+            message = (
+                f"mirror_average: shapes of the kind {kind} have no mirror image, which the elastic law needs; set mirror_average=false"
+            )
+            return SimulationError(message, reason="input")
         back = [reflection.state(image, state.boundary) for reflection, image in images]
         changes = [state.periodicity.shortest(other.pos - state.pos) for other in back]
         stress = [s.stress for s in (state, *back) if s.stress is not None]

@@ -104,7 +104,7 @@ class LearnedSimulator(nn.Module):
             raise GraphError("graph.stress=true: the model predicts no stress, which its next step reads; set model.stress=true")
         self.model, self.stride = model, stride
         self.builder = replace(builder, reads_relief=bool(model.settings.get("wall_layer")))
-        self._static_friction, self._averaged = 0.0, MirrorAverage(builder.metadata.bounds, builder.metadata.frame_dt)
+        self._static_friction, self._averaged = 0.0, MirrorAverage.of(builder, model)
         self._warned: set[str] = set()
         self._unknown: list[str | EdgeType] | None = None  # None: not determined yet
         self.standardizer = GraphStandardizer(builder.spec, builder.config.parameter_scale)
@@ -177,7 +177,7 @@ class LearnedSimulator(nn.Module):
             return self
         other = copy.copy(self)
         other.builder = self.builder.at(scene.spacing, scene.frame_dt)
-        other._averaged = MirrorAverage(other.builder.metadata.bounds, other.builder.metadata.frame_dt)
+        other._averaged = MirrorAverage.of(other.builder, self.model)
         other.least_distance = self.least_distance * scene.spacing / self.builder.metadata.spacing
         return other
 

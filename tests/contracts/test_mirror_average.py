@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +16,7 @@ from gpe_pl.data.ground_truth import generate_trajectory
 from gpe_pl.data.noise import Noise
 from gpe_pl.evaluation.mirror_check import mirror_equivariance_error
 from gpe_pl.export.program import MirrorAverageError, export_model
+from gpe_pl.geometry.shapes import DistanceGrid, Sphere, domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.checkpoint_file import CheckpointError
@@ -22,11 +25,15 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.loop import SimulationError, Simulator, steps
 from gpe_pl.rollout.mirrored import Mirrored
+from gpe_pl.schema import node_code
+from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
+from tests import elastic, scenes
 from tests.runs import compose
 
 START, STEPS = 60, 8  # bodies touch the ground by then
+DISC = Sphere((0.5, 0.2), 0.1, 0.3)
 
 
 @pytest.fixture(scope="module", params=["sand", pytest.param("fluid", marks=pytest.mark.slow), "fem"])
@@ -143,3 +150,60 @@ def test_the_boundary_may_change_between_steps(scene: tuple[LearnedSimulator, Tr
         *_, once = steps(mean, begin, 2)
         *_, again = steps(averaged(learned), begin, 2)
         assert torch.equal(once.pos, again.pos)
+
+
+class Unmirrored:
+    """An obstacle of a class for which no mirror image is known."""
+
+    kind, friction, restitution, extent = "unmirrored", 0.3, 0.0, 0.1
+
+    def signed_distance(self, points: Any) -> Any:
+        return DISC.signed_distance(points)
+
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        return DISC.sample(spacing)
+
+
+def falling_on(obstacle: Any) -> tuple[State, np.ndarray]:
+    """Return a symmetric lattice that falls on an obstacle in the middle of the domain, and the row of the mirror image of each node."""
+    number, h = np.arange(28).reshape(7, 4), scenes.SPACING
+    cells = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1).reshape(-1, 4)
+    rest = h * np.argwhere(number >= 0) + np.array([0.5 - 3 * h, 0.31])
+    vel = np.tile([0.0, -2.0], (28, 1))
+    state = scenes.mesh_state("lattice", elastic.BODIES, 1, seed=0)
+    state = replace(
+        state,
+        pos=rest,
+        vel=vel,
+        velocity_history=vel[:, None],
+        node_type=np.full(28, node_code(elastic.BODIES[0]), np.uint8),
+        mass=np.ones(28),
+        material_params=np.full((28, 1), 20.0),
+        rest_pos=rest.copy(),
+        cells=cells,
+        boundary=Boundary.sample((*domain_walls(((0.0, 1.0),) * 2, 0.3), obstacle), h, 2),
+    )
+    return state.to_torch(), number[::-1].reshape(-1)
+
+
+@pytest.mark.parametrize("as_grid", [False, True])
+def test_the_elastic_law_sees_the_images_of_obstacles(as_grid: bool) -> None:
+    nodes = np.stack(np.meshgrid(*2 * [0.02 * np.arange(51)], indexing="ij"), axis=-1)
+    grid = DistanceGrid.from_values((0.0, 0.0), 0.02, DISC.signed_distance(nodes), 0.3)
+    state, image = falling_on(grid if as_grid else DISC)
+    simulator = elastic.simulator(network=0.0, wall_layer=1.0)
+    for _ in range(6):
+        state = averaged(simulator).step(state)
+    mirrored = state.pos[image] * torch.tensor([-1.0, 1.0]) + torch.tensor([1.0, 0.0])
+    assert float((state.vel[:, 1] + 2.0).abs().max()) > 0.5  # it has met the obstacle
+    assert float((state.pos - mirrored).abs().max()) < 1e-5 * scenes.SPACING
+
+
+def test_a_shape_without_an_image_is_refused_for_the_elastic_law() -> None:
+    state, _ = falling_on(Unmirrored())
+    simulator = averaged(elastic.simulator())
+    with pytest.raises(SimulationError, match="mirror_average: shapes of the kind unmirrored have no mirror image"):
+        simulator.step(state)
+    known, _ = falling_on(DISC)
+    refused, moved = simulator.step_all([state, known])
+    assert isinstance(refused, SimulationError) and isinstance(moved, State)

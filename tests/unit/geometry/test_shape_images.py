@@ -7,17 +7,40 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Polygon, Sphere, domain_walls
+from gpe_pl.geometry.periodicity import Periodicity
+from gpe_pl.geometry.repeated_shapes import Repeated
+from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Polygon, Shape, Sphere, domain_walls
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.reflection import Isometry, Reflection, Rotation, level_axes
 
 BOUNDS = ((-0.2, 1.0), (0.1, 0.9))
+
+
+def grid_of(shape: Shape, low: tuple[float, ...], counts: tuple[int, ...], spacing: float = 0.05) -> DistanceGrid:
+    """Return a shape as a grid of distances."""
+    nodes = np.stack(np.meshgrid(*(x + spacing * np.arange(n) for x, n in zip(low, counts, strict=True)), indexing="ij"), axis=-1)
+    return DistanceGrid.from_values(low, spacing, shape.signed_distance(nodes), shape.friction, shape.restitution)
+
+
+class Unmirrored:
+    """A half-space with a face along the first axis."""
+
+    kind, friction, restitution, extent = "unmirrored", 0.3, 0.0, 1.0
+
+    def signed_distance(self, points: Any) -> Any:
+        return points[..., 1]
+
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([[0.0, 0.0]]), np.array([[0.0, 1.0]])
+
+
 SHAPES: list[Any] = [
     *domain_walls(BOUNDS, 0.3),
     Sphere((0.3, 0.4), 0.1, 0.2, 0.5),
     Bowl((0.3, 0.4), 0.3, 0.2),
     Box((0.1, 0.2), (0.3, 0.5), 0.4),
     Polygon(((0.1, 0.1), (0.5, 0.2), (0.2, 0.4)), 0.6),
+    grid_of(Sphere((0.3, 0.4), 0.1, 0.2, 0.5), (0.1, 0.15), (9, 11)),
 ]
 
 
@@ -34,7 +57,7 @@ def test_images_are_as_far_from_images_of_points(shape: Any, isometry: Isometry)
     assert (image.friction, image.restitution) == (shape.friction, shape.restitution)
     np.testing.assert_allclose(image.signed_distance(isometry.point(points)), shape.signed_distance(points), atol=1e-12)
     surface, normal = image.sample(0.05)
-    if shape.kind not in ("sphere", "bowl"):  # whose points begin on one axis
+    if shape.kind not in ("sphere", "bowl", "distance_grid"):  # whose points begin on one axis or at one corner
         expected = isometry.point(shape.sample(0.05)[0])
         np.testing.assert_allclose([surface.min(axis=0), surface.max(axis=0)], [expected.min(axis=0), expected.max(axis=0)], atol=1e-12)
     assert (image.signed_distance(surface + 1e-3 * normal) > 0).all()
@@ -44,7 +67,13 @@ def test_images_are_as_far_from_images_of_points(shape: Any, isometry: Isometry)
 def test_images_of_three_dimensional_shapes_under_quarter_turns(number: int) -> None:
     turn, points = Rotation.between_axes(number, (0.2, 0.5, 0.1)), np.random.default_rng(0).uniform(-0.5, 1.5, (200, 3))
     bounds = ((-0.2, 1.0), (0.1, 0.9), (0.0, 0.5))
-    shapes: list[Any] = [*domain_walls(bounds, 0.3), Box((0.1, 0.2, 0.0), (0.3, 0.5, 0.2), 0.4), Sphere((0.3, 0.4, 0.1), 0.1, 0.2)]
+    ball = Sphere((0.3, 0.4, 0.1), 0.1, 0.2)
+    shapes: list[Any] = [
+        *domain_walls(bounds, 0.3),
+        Box((0.1, 0.2, 0.0), (0.3, 0.5, 0.2), 0.4),
+        ball,
+        grid_of(ball, (0.1, 0.2, 0.0), (9, 8, 5)),
+    ]
     for shape in shapes:
         (image,) = turn.shapes([shape])
         np.testing.assert_allclose(image.signed_distance(turn.point(points)), shape.signed_distance(points), atol=1e-12)
@@ -58,8 +87,28 @@ def test_a_boundary_keeps_its_shapes_if_all_have_images() -> None:
     mirror = Reflection((0.4, None))
     image = mirror.boundary(Boundary.sample(tuple(SHAPES), 0.05, 2))
     assert len(image.shapes) == len(SHAPES)
-    grid = DistanceGrid.from_values(np.zeros(2), 0.1, np.linspace(-1, 1, 36).reshape(6, 6), 0.3)
-    assert mirror.boundary(Boundary.sample((*SHAPES, grid), 0.05, 2)).shapes == ()
+    assert mirror.boundary(Boundary.sample((*SHAPES, Unmirrored()), 0.05, 2)).shapes == ()
+
+
+def test_two_mirror_images_of_a_grid_are_the_grid() -> None:
+    grid, mirror = SHAPES[-1], Reflection((0.5, 0.25))
+    (image,) = mirror.shapes([grid])
+    assert mirror.shapes([image])[0].values.tolist() == grid.values.tolist()
+
+
+@pytest.mark.parametrize("shape", [s for s in SHAPES if s.kind != "wall"], ids=lambda shape: shape.kind)
+@pytest.mark.parametrize("periodic", [(True, False), (True, True)])
+def test_repeated_shapes_repeat_their_image(shape: Any, periodic: tuple[bool, bool]) -> None:
+    space = Periodicity(BOUNDS, periodic)
+    for mirror in (Reflection.of(BOUNDS, [0]), Reflection.of(BOUNDS, [0, 1])):
+        (image,), points = mirror.shapes([Repeated(shape, space)]), np.random.default_rng(0).uniform(-0.2, 0.9, (200, 2))
+        expected = Repeated(shape, space).signed_distance(points)
+        np.testing.assert_allclose(image.signed_distance(mirror.point(points)), expected, atol=1e-12)
+        assert image.periodicity is space
+    turn = next(turn for k in range(4) if (turn := Rotation.between_axes(k, (0.2, 0.5))).matrix[0, 1] == 1)
+    (image,) = turn.shapes([Repeated(shape, space)])
+    assert image.periodicity.periodic == periodic[::-1]
+    np.testing.assert_allclose(image.signed_distance(turn.point(points)), expected, atol=1e-12)
 
 
 def test_rounding_makes_no_gravity() -> None:
