@@ -73,13 +73,17 @@ class Sleeping(Batched):
         simulator: simulator, whose ``skips`` set when islands sleep.
 
     Raises:
-        GraphError: the model reads the stress.
+        GraphError: the model reads the stress, or predicts it per strain of the whole scene.
     """
 
     def __init__(self, simulator: LearnedSimulator) -> None:
         if simulator.builder.spec.reads_stress:
             raise GraphError(
                 "rollout.sleep_after: models with graph.stress=true need the stress of all nodes; set rollout.sleep_after=null"
+            )
+        if simulator.model.settings.get("stress_unit") == "strain" and not simulator.skips.stress:
+            raise GraphError(
+                "rollout.sleep_after: models with model.stress_unit=strain need the strain of all nodes; set rollout.sleep_after=null"
             )
         self.simulator = simulator
         self.radius, self.dt = simulator.builder.scales.radius, simulator.builder.metadata.frame_dt

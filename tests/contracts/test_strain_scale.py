@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from gpe_pl.graphs.topology import GraphError
+from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.testing import scenes
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.elastic_bodies import CellError, cells_at_rest
 from gpe_pl.nn.strain_scale import FIRST_GUESS, rms_strain
 from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.rollout.skips import Skips
 from gpe_pl.trajectory.state import State
 
 SOLID = "solid"
@@ -112,6 +115,15 @@ def test_a_checkpoint_keeps_its_unit(tmp_path: Any) -> None:
     stress, again = gpe.step(state).stress, LearnedSimulator.from_checkpoint(tmp_path / "gpe.ckpt").step(state).stress
     assert stress is not None and again is not None
     torch.testing.assert_close(again.node, stress.node)
+
+
+def test_sleeping_is_refused_unless_the_stress_is_left_out() -> None:
+    """The strain of the awake bodies is another one than that of the whole scene."""
+    made = simulator(2)
+    with pytest.raises(GraphError, match="sleep_after: models with model.stress_unit=strain"):
+        approximate(made.configured(skips=Skips(sleep_after=3)))
+    runner = approximate(made.configured(skips=Skips(sleep_after=3, stress=True)))
+    assert runner.step(strained("triangles", 0.02)).stress is None
 
 
 def test_what_it_needs_is_named() -> None:
