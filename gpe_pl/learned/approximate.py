@@ -20,7 +20,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.flow import FollowsNodes
 from gpe_pl.rollout.loop import SimulationError, Simulator, sound, step_all
 from gpe_pl.trajectory import integrators
-from gpe_pl.trajectory.boundary import search_tree
+from gpe_pl.trajectory.boundary import Boundary, search_tree
 from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.state import State, Stress
 
@@ -47,21 +47,35 @@ class Batched(ABC):
 
 @dataclass(frozen=True)
 class _Rest:
-    """Number of predictions in a row for which each node has been at rest [node]."""
+    """How long nodes have been at rest, and in which surroundings.
+
+    Attributes:
+        count: number of predictions in a row for which each node has been at rest [node].
+        gravity: gravity [dim] in m/s²; None if it is not known.
+        boundary: boundary without a prescribed motion; None if it moves or is not known.
+    """
 
     count: Tensor
+    gravity: Tensor | None = None
+    boundary: Boundary | None = None
 
     def of_rows(self, rows: np.ndarray) -> _Rest:
         """Return the counts of other nodes, as ``rollout.flow.FollowsNodes``; nodes that are new or move with an opening have not been at rest."""
         row = torch.from_numpy(rows).to(self.count.device)
-        return _Rest(torch.where(row >= 0, self.count[row.clamp(min=0)], 0))
+        return replace(self, count=torch.where(row >= 0, self.count[row.clamp(min=0)], 0))
+
+    def holds_in(self, state: State) -> bool:
+        """Return whether gravity and boundary are still those in which nodes came to rest."""
+        same_gravity = self.gravity is None or bool((state.gravity == self.gravity).all())
+        return same_gravity and (self.boundary is None or _are_equal(self.boundary, state.boundary))
 
 
 class Sleeping(Batched):
     """Simulator in which islands at rest sleep: their nodes keep their positions and are not computed.
 
     An island wakes up when a node that is awake, or a wall that moves with a prescribed motion, comes within the radius of the graph, and when a force acts on
-    one of its nodes or a given motion moves one.
+    one of its nodes, a given motion moves one, or one gets a velocity. All islands wake up when gravity or a boundary without a prescribed motion is changed
+    between steps.
 
     An island (see ``graphs.islands``) falls asleep if all its nodes have been at rest in the last ``Skips.sleep_after`` predictions.
     ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` limit velocities at rest: those at the frame if the model predicts them, otherwise
@@ -102,7 +116,7 @@ class Sleeping(Batched):
         """Return masks [node] of the awake nodes and of all nodes that the graph for their prediction contains."""
         after = self.simulator.skips.sleep_after
         assert after is not None
-        is_calm = (_rest_of(state) >= after).cpu().numpy()
+        is_calm = ((_rest_of(state) >= after) & self._are_slow(_velocity(state))).cpu().numpy()
         if not is_calm.any():
             everything = torch.ones(state.num_nodes, dtype=torch.bool, device=state.pos.device)
             return everything, everything
@@ -133,6 +147,10 @@ class Sleeping(Batched):
             near[radius_between(walls, pos, self.radius, state.periodicity)[1]] = True
         return near
 
+    def _are_slow(self, velocity: Tensor) -> Tensor:
+        """Return a mask [node] of the nodes that are as slow as nodes at rest, given velocities [node, dim] in m/s."""
+        return velocity.norm(dim=1) < self.simulator.skips.rest_step_spacings * self.simulator.builder.metadata.spacing / self.dt
+
     def _combined(self, state: State, after: State, awake: Tensor, seen: Tensor) -> State:
         """Return the next state, in which awake nodes have moved and all others stay."""
         pos, vel = state.pos.clone(), torch.zeros_like(state.vel)
@@ -142,12 +160,12 @@ class Sleeping(Batched):
         if after.frame_velocity is not None:
             at_frame = torch.zeros_like(state.vel)
             at_frame[awake] = after.frame_velocity[moved]
-            before, now = before if state.frame_velocity is None else state.frame_velocity, at_frame
-        skips, unit = self.simulator.skips, self.simulator.builder.metadata.spacing / self.dt
-        is_slow = now.norm(dim=1) < skips.rest_step_spacings * unit
-        calm = is_slow & ((now - before).norm(dim=1) < skips.rest_step_change_spacings * unit)
-        count = torch.where(awake, torch.where(calm, _rest_of(state) + 1, 0), _rest_of(state))
-        return state.later(
+            before, now = _velocity(state), at_frame
+        least_change = self.simulator.skips.rest_step_change_spacings * self.simulator.builder.metadata.spacing / self.dt
+        calm = self._are_slow(now) & ((now - before).norm(dim=1) < least_change)
+        known = _rest_of(state)
+        count = torch.where(awake, torch.where(calm, known + 1, 0), known)
+        new = state.later(
             self.dt,
             pos,
             vel,
@@ -155,8 +173,8 @@ class Sleeping(Batched):
             stress=_combined_stress(state, after, awake, moved),
             num_asleep=int((~awake).sum()),
             lost_impulse=float((state.mass * before.norm(dim=1))[~awake].sum()),
-            internal=_Rest(count),
         )
+        return replace(new, internal=_Rest(count, state.gravity.clone(), new.boundary if new.boundary.motion is None else None))
 
 
 def _are_loaded(loads: Loads) -> np.ndarray:
@@ -166,8 +184,23 @@ def _are_loaded(loads: Loads) -> np.ndarray:
     return moves if loads.force is None else moves | (loads.force[0] != 0).any(axis=1)
 
 
+def _are_equal(one: Boundary, other: Boundary) -> bool:
+    """Return whether two boundaries are the same, or have the same nodes, shapes and no motion."""
+    if one is other:
+        return True
+    pairs = [(getattr(one, name), getattr(other, name)) for name in ("pos", "vel", "normal", "friction", "restitution")]
+    same_nodes = all(a.shape == b.shape and bool((a == b).all()) for a, b in pairs)
+    return same_nodes and one.shapes == other.shapes and one.motion is None and other.motion is None
+
+
+def _velocity(state: State) -> Tensor:
+    """Return the velocities that tell whether nodes are at rest [node, dim] in m/s: those at the frame if they are known, else mean ones."""
+    return state.vel if state.frame_velocity is None else state.frame_velocity
+
+
 def _rest_of(state: State) -> Tensor:
-    if isinstance(state.internal, _Rest):
+    """Return the number of predictions in a row for which each node has been at rest [node]; zeros if the surroundings have changed."""
+    if isinstance(state.internal, _Rest) and state.internal.holds_in(state):
         return state.internal.count
     return torch.zeros(state.num_nodes, dtype=torch.int64, device=state.pos.device)
 

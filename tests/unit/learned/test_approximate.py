@@ -133,6 +133,43 @@ def test_a_single_restless_node_keeps_its_island_awake() -> None:
     assert sleeping.step(start).num_asleep == 20  # the other island
 
 
+def asleep_on_the_floor() -> tuple[Sleeping, State]:
+    """Return two heaps that sleep, far from each other, and what lets them."""
+    sleeping, state = Sleeping(silenced(simulator(scenes.builder()))), two_heaps(gap=1.0, speed=0.0).to_torch()
+    for _ in range(3):
+        state = sleeping.step(state)
+    assert state.num_asleep == 40
+    return sleeping, state
+
+
+def test_another_gravity_wakes_everything() -> None:
+    sleeping, state = asleep_on_the_floor()
+    tilted = replace(state, gravity=torch.tensor([9.81, 0.0], dtype=torch.float64))
+    after = sleeping.step(tilted)
+    assert after.num_asleep == 0
+    torch.testing.assert_close(after.vel, sleeping.simulator.step(tilted).vel)
+    assert sleeping.step(after).num_asleep == 0  # counts from the start
+    assert sleeping.step(replace(state, gravity=state.gravity.clone())).num_asleep == 40
+
+
+def test_another_boundary_wakes_everything() -> None:
+    sleeping, state = asleep_on_the_floor()
+    walls = state.boundary
+    for other in (replace(walls, pos=walls.pos - 5.0), replace(walls, friction=0.5 * walls.friction), walls.take(torch.arange(3))):
+        assert sleeping.step(replace(state, boundary=other)).num_asleep == 0
+    assert sleeping.step(replace(state, boundary=replace(walls, pos=walls.pos.clone()))).num_asleep == 40
+
+
+def test_a_node_that_is_given_a_velocity_wakes_its_island() -> None:
+    sleeping, state = asleep_on_the_floor()
+    vel = state.vel.clone()
+    vel[3] = 1.0
+    kicked = state.corrected(state.pos, vel)
+    after = sleeping.step(kicked)
+    assert after.num_asleep == 20
+    torch.testing.assert_close(after.vel, sleeping.simulator.step(kicked).vel)
+
+
 def test_momentum_is_lost_once_and_counted() -> None:
     simulated = silenced(simulator(scenes.builder(), rest_step_spacings=0.01))
     state = two_heaps(gap=1.0).to_torch()
