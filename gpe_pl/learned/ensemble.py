@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,9 @@ from gpe_pl.rollout.loop import Simulator
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
+SAME_RADIUS = 0.01
+"""Relative difference up to which radii, in spacings, are the same."""
+
 
 @dataclass(frozen=True)
 class LearnedEnsemble(Ensemble):
@@ -23,7 +27,7 @@ class LearnedEnsemble(Ensemble):
     members are from each other.
 
     Attributes:
-        members: models with the same frame interval, spacing, materials and history.
+        members: models with the same frame interval, spacing, materials, history, radius and ``graph.cells``, so that they share their starts.
 
     Raises:
         CheckpointError: there is no member, or one does not fit the first.
@@ -35,10 +39,8 @@ class LearnedEnsemble(Ensemble):
         if not self.members:
             raise CheckpointError("an ensemble needs at least one model")
         for number, other in enumerate(self.members[1:], start=1):
-            if not _fit(self.members[0], other):
-                raise CheckpointError(
-                    f"member {number} has other materials, frames, spacing or history than member 0; members of an ensemble share them"
-                )
+            if difference := _difference(self.members[0], other):
+                raise CheckpointError(f"member {number} has other {difference} than member 0; members of an ensemble share them")
 
     @classmethod
     def from_checkpoints(cls, checkpoints: Sequence[Path | str], device: Any = "cpu") -> LearnedEnsemble:
@@ -55,10 +57,8 @@ class LearnedEnsemble(Ensemble):
             raise CheckpointError("an ensemble needs at least one checkpoint; name some")
         members = tuple(LearnedSimulator.from_checkpoint(path, device) for path in checkpoints)
         for path, other in zip(checkpoints[1:], members[1:], strict=True):
-            if not _fit(members[0], other):
-                raise CheckpointError(
-                    f"{path}: has other materials, frames, spacing or history than {checkpoints[0]}; members of an ensemble share them"
-                )
+            if difference := _difference(members[0], other):
+                raise CheckpointError(f"{path}: has other {difference} than {checkpoints[0]}; members of an ensemble share them")
         return cls(members)
 
     def on(self, scene: Metadata) -> LearnedEnsemble:
@@ -76,9 +76,15 @@ class LearnedEnsemble(Ensemble):
         return first
 
 
-def _fit(one: LearnedSimulator, other: LearnedSimulator) -> bool:
+def _difference(one: LearnedSimulator, other: LearnedSimulator) -> str | None:
+    """Describe in what two models differ that members of an ensemble share; None if they fit each other."""
     own, there = one.builder, other.builder
-    return one.fits(there.metadata) and other.fits(own.metadata) and own.config.history == there.config.history
+    if not (one.fits(there.metadata) and other.fits(own.metadata) and own.config.history == there.config.history):
+        return "materials, frames, spacing or history"
+    if own.config.cells != there.config.cells:
+        return "velocities at the start (graph.cells)"
+    reach = [builder.scales.radius / builder.metadata.spacing for builder in (own, there)]
+    return None if math.isclose(*reach, rel_tol=SAME_RADIUS) else "neighbours (connectivity radius)"
 
 
 def members_of(simulator: LearnedSimulator | LearnedEnsemble) -> tuple[LearnedSimulator, ...]:

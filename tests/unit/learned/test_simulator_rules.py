@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -11,8 +12,10 @@ from gpe_pl.geometry.shapes import Sphere
 from gpe_pl.learned.checkpoint_file import CheckpointError
 from gpe_pl.learned.ensemble import LearnedEnsemble
 from gpe_pl.learned.simulator import LearnedSimulator, PrecisionError
+from gpe_pl.models.gpe import GPE
 from gpe_pl.scenes.scene import Scene
 from gpe_pl.trajectory.boundary import Boundary
+from tests import scenes
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -26,6 +29,11 @@ def test_half_precision_is_refused_and_changes_nothing(dtype: torch.dtype) -> No
     assert next(simulator.double().model.parameters()).dtype == torch.float64
 
 
+def plain_model(**config: Any) -> LearnedSimulator:
+    builder = scenes.builder(("elastomer",), 2, mesh=True, **config)
+    return LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder).eval()
+
+
 def test_members_of_an_ensemble_fit_each_other() -> None:
     sand, snow = (LearnedSimulator.from_checkpoint(name) for name in ("sand", "snow"))
     with pytest.raises(CheckpointError, match="an ensemble needs at least one model"):
@@ -33,6 +41,22 @@ def test_members_of_an_ensemble_fit_each_other() -> None:
     with pytest.raises(CheckpointError, match="member 1 has other materials, frames, spacing or history than member 0"):
         LearnedEnsemble((sand, snow))
     assert len(LearnedEnsemble((sand, sand)).members) == 2
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+@pytest.mark.parametrize(
+    ("other", "difference"),
+    [
+        ({"cells": True}, r"velocities at the start \(graph.cells\)"),
+        ({"connectivity_spacings": 2.0}, r"neighbours \(connectivity radius\)"),
+    ],
+)
+def test_members_that_start_otherwise_are_refused(other: dict[str, Any], difference: str, order: tuple[int, int]) -> None:
+    """Otherwise the start of the ensemble would be that of its first member."""
+    members = [plain_model(**config) for config in ({}, other)]
+    with pytest.raises(CheckpointError, match=f"member 1 has other {difference} than member 0"):
+        LearnedEnsemble(tuple(members[k] for k in order))
+    assert len(LearnedEnsemble((members[1], members[1])).members) == 2
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
