@@ -175,7 +175,7 @@ class LearnedSimulator(nn.Module):
         self.check_scene(scene)
         if self.builder.config.scales == "one":
             return self
-        other = copy.copy(self)
+        other = self.configured()
         other.builder = self.builder.at(scene.spacing, scene.frame_dt)
         other._averaged = MirrorAverage.of(other.builder, self.model)
         other.least_distance = self.least_distance * scene.spacing / self.builder.metadata.spacing

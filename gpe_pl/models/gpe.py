@@ -165,7 +165,7 @@ class GPE(Model):
                 f"model.stress=true: the data set stores no stress of {', '.join(spec.materials)}; set model.stress=false or, for MPM, data.solver.stress=true"
             )
         self.interaction, self.decoder, self.edge_state = interaction, decoder, edge_state
-        self._program: GPEProgramRunner | None = None
+        self._program: list[GPEProgramRunner | None] = [None]  # shallow copies, which share the weights, share it
         self.level_weights = level_weights
         self.num_message_passing_steps = num_message_passing_steps
         hidden, norm = hidden_channels, node_norm == "layer"
@@ -311,9 +311,10 @@ class GPE(Model):
             return None
         if type(self) is not GPE:
             return notice(f"{type(self).__name__} is a subclass of GPE")
-        if self._program is None or not self._program.is_current():
-            self._program = GPEProgramRunner(self)
-        return self._program(data, self.skips, keep_absent)
+        program = self._program[0]
+        if program is None or not program.is_current():
+            program = self._program[0] = GPEProgramRunner(self)
+        return program(data, self.skips, keep_absent)
 
     def _uncompiled(self, data: HeteroData, keep_absent: bool) -> Decoded:
         x = {t: data[t].x for t in self.spec.node_types if self.type_key(t) in self.node_encoder and (keep_absent or data[t].x.shape[0])}

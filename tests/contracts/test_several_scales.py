@@ -76,6 +76,18 @@ def test_similar_scenes_have_the_same_graph_except_for_the_stiffness(compiled: b
     assert there["sand"].x[0, -1].item() == pytest.approx(np.log2(SLOWER / LONGER))
 
 
+def test_skips_of_a_copy_for_another_scale_leave_the_original_alone() -> None:
+    original = learned(built())
+    kept, model = original.skips, original.model
+    copied = original.at(spacing=LONGER * original.spacing)
+    copied.skips = replace(kept, absent_types=False, sleep_after=3)
+    assert original.skips == kept == original.model.skips and original.model is model
+    assert copied.skips == copied.model.skips != kept
+    assert all(own is there for own, there in zip(original.parameters(), copied.parameters(), strict=True))
+    copied.step(similar(scenes.state(40, history=2)).to_torch())
+    assert isinstance(model, GPE) and model._program[0] is not None  # the compiled network is written once for all copies
+
+
 def test_a_model_steps_similar_scenes_alike() -> None:
     build, s = built(), scenes.state(40, history=2)
     simulator = learned(build)
