@@ -99,7 +99,7 @@ class MirrorAverage:
         changes = [state.periodicity.shortest(other.pos - state.pos) for other in back]
         stress = [s.stress for s in (state, *back) if s.stress is not None]
         mean = [_mean([getattr(s, name) for s in (state, *back)]) for name in ("vel", "velocity_history", "frame_velocity")]
-        pos = state.pos + sum(changes) / (1 + len(back))
+        pos = state.periodicity.wrapped(state.pos + sum(changes) / (1 + len(back)))
         values = {"pos": pos, "vel": mean[0], "velocity_history": mean[1], "frame_velocity": mean[2]}
         if state.loads is not None:  # an average would round the given motion
             values = {name: v if v is None else state.loads.at_prescribed(getattr(state, name), v) for name, v in values.items()}

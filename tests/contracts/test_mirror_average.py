@@ -141,6 +141,25 @@ def test_programs_refuse_it(scene: tuple[LearnedSimulator, Trajectory], tmp_path
         export_model(averaged(scene[0]), tmp_path / "model.pt2")
 
 
+def test_averaged_nodes_stay_in_a_periodic_domain() -> None:
+    bounds = ((0.0, 0.5), (0.0, 1.0))
+    space = replace(scenes.metadata(), bounds=bounds, periodic=(True, False))
+    builder = GraphBuilder(GraphConfig(history=1), space)
+    torch.manual_seed(0)
+    simulator = averaged(LearnedSimulator(GPE(builder.spec, num_message_passing_steps=2, hidden_channels=8), builder).eval())
+    for parameter in simulator.model.parameters():
+        if not parameter.any():
+            torch.nn.init.normal_(parameter, std=0.1)
+    simulator.acceleration_std.fill_(400.0)
+    state = scenes.state(40)
+    pos = np.random.default_rng(0).uniform((0.49, 0.0), (0.5, 1.0), (40, 2))  # beside the seam
+    state = replace(state, pos=pos, vel=0.0 * state.vel, velocity_history=0.0 * state.vel[:, None], boundary=Boundary.empty(2))
+    state = replace(state, periodicity=space.periodicity).to_torch()
+    x = simulator.step(state).pos[:, 0]
+    assert float(simulator.configured(mirror_average=False).step(state).pos[:, 0].min()) < 0.1  # some have crossed it
+    assert bool(((x >= 0) & (x < 0.5)).all())
+
+
 def test_the_boundary_may_change_between_steps(scene: tuple[LearnedSimulator, Trajectory]) -> None:
     learned, trajectory = scene
     mean = averaged(learned)
