@@ -70,7 +70,8 @@ def distance_in(trajectories: Iterable[Trajectory], quantile: float) -> float:
 def kept_apart(state: State, distance: float, dt: float) -> State:
     """Return a state whose liquid nodes are hardly nearer to each other than a distance. Velocities change by displacement / ``dt``.
 
-    Nodes of rigid bodies stay where they are. Nodes that move apart may come too near to others, so a small part of a gap can remain.
+    Nodes of rigid bodies stay where they are. Along axes of a given motion, nodes have an infinite mass. Nodes that move apart may come too near to others, so
+    a small part of a gap can remain.
 
     Args:
         state: state after a step, as tensors.
@@ -88,7 +89,11 @@ def kept_apart(state: State, distance: float, dt: float) -> State:
     pairs = radius_pairs(np.ascontiguousarray(start.detach().cpu().numpy()), MARGIN * distance, state.periodicity)
     i, j = torch.from_numpy(pairs).to(rows.device)
     mass = state.mass[rows].to(start)
-    weight = torch.stack([mass[j], mass[i]]) / (mass[i] + mass[j])
+    weight = (torch.stack([mass[j], mass[i]]) / (mass[i] + mass[j]))[..., None]
+    if state.loads is not None:
+        given = torch.from_numpy(state.loads.prescribed).to(rows.device)[rows]
+        own, other = torch.stack([given[i], given[j]]), torch.stack([given[j], given[i]])
+        weight = torch.where(own, 0.0, torch.where(other, 1.0, weight))
     pos, has_moved = start, False
     for _ in range(NUM_PASSES):
         way = state.periodicity.shortest(pos[i] - pos[j])
@@ -98,7 +103,7 @@ def kept_apart(state: State, distance: float, dt: float) -> State:
         if not bool((gap > 0).any()):
             break
         push = (RELAXATION * gap.clamp(min=0) / length)[:, None] * way
-        pos = pos.index_add(0, i, weight[0, :, None] * push).index_add(0, j, weight[1, :, None] * push, alpha=-1)
+        pos = pos.index_add(0, i, weight[0] * push).index_add(0, j, weight[1] * push, alpha=-1)
         has_moved = True
     if not has_moved:
         return state

@@ -18,6 +18,7 @@ from gpe_pl.learned.testing import scenes
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import node_code
 from gpe_pl.trajectory.arrays import nearest_distances
+from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -69,6 +70,31 @@ def test_rigid_bodies_of_a_liquid_keep_their_shape() -> None:
     after = kept_apart(replace(state, rigid_body=body), DISTANCE, DT)
     assert torch.equal(after.pos[:12], state.pos[:12])
     assert not torch.equal(after.pos[12:], state.pos[12:])
+
+
+def test_nodes_beside_prescribed_ones_move_all_the_way() -> None:
+    """A prescribed node stays, as if its mass were infinite; along its free axes, the masses count."""
+    pos = torch.tensor([[0.3, 0.3], [0.33, 0.3]], dtype=torch.float64)
+    left = 0.01 * 0.7**10  # of the gap, after ten passes
+    for given, share in (([True, True], 1.0), ([True, False], 1.0), ([False, True], 0.25)):
+        held = np.array([given, [False, False]])
+        state = replace(liquid(num_nodes=2), mass=torch.tensor([1.0, 3.0], dtype=torch.float64), pos=pos)
+        state = replace(state, loads=Loads(held, np.repeat(pos.numpy()[None, :1], 2, axis=0)))
+        after = kept_apart(state, DISTANCE, DT)
+        way = (0.01 - left) * torch.tensor([[share - 1, 0.0], [share, 0.0]], dtype=torch.float64)
+        torch.testing.assert_close(after.pos, pos + way, rtol=0, atol=1e-12)
+    both = replace(state, loads=Loads(np.ones((2, 2), bool), np.repeat(pos.numpy()[None], 2, axis=0)))
+    assert torch.equal(kept_apart(both, DISTANCE, DT).pos, pos)
+
+
+def test_free_nodes_keep_their_distance_from_many_prescribed_ones() -> None:
+    state = liquid(num_nodes=60)
+    held = np.zeros((60, 2), bool)
+    held[:30] = True
+    state = replace(state, loads=Loads(held, np.repeat(state.pos.numpy()[None, :30], 2, axis=0)))
+    after = kept_apart(state, 0.03, DT)
+    assert torch.equal(after.pos[:30], state.pos[:30])
+    assert float(torch.cdist(after.pos[:30], after.pos[30:]).min()) > 0.8 * 0.03
 
 
 def test_nodes_apart_and_other_materials_stay() -> None:
