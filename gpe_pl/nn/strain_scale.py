@@ -62,11 +62,11 @@ class StrainScale(nn.Module):
         store = data[material]
         if "ptr" in store:
             raise CellError("PyTorch Geometric's Batch does not renumber cells; join graphs with gpe_pl.graphs.batching.batched")
-        mean, scene = store.velocity[:, : self.dim].double(), store.batch if "batch" in store else None
+        (mean, at_frame), scene = store.velocity.double().split(self.dim, dim=1), store.batch if "batch" in store else None
         gravity = data.gravity.double() if scene is None else data.gravity.double()[scene]
         way = mean + acceleration.detach().double() * self.acceleration_unit + gravity
         if "prescribed" in store:
-            way = torch.where(store.prescribed, mean, way)
+            way = torch.where(store.prescribed, at_frame, way)  # there it is the velocity of this frame, see ``graphs.load_features``
         cells = cells_at_rest(material, store.cell_index, store.rest_pos, store.mass, scene)
         strain = rms_strain(store.body_pos.double() + way, cells).to(acceleration)
         factor = strain / FIRST_GUESS * torch.exp(-cast(Tensor, self.typical[material]))

@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 import torch
 
+from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.topology import GraphError
 from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.testing import scenes
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.elastic_bodies import CellError, cells_at_rest
-from gpe_pl.nn.strain_scale import FIRST_GUESS, rms_strain
+from gpe_pl.nn.strain_scale import FIRST_GUESS, StrainScale, rms_strain
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
+from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.state import State
 
 SOLID = "solid"
@@ -99,6 +101,33 @@ def test_the_compiled_network_has_the_same_stress() -> None:
         plain = gpe.model(gpe.standardizer(gpe.builder(state))).stress[SOLID]
     assert fast is not None
     torch.testing.assert_close(fast.node, (plain * gpe.stress_std).to(fast.node.dtype), rtol=1e-4, atol=1.0)
+
+
+def test_nodes_whose_motion_is_given_count_where_this_frame_takes_them() -> None:
+    build = scenes.builder((SOLID,), mesh=True, cells=True)
+    build = GraphBuilder(build.config, replace(build.metadata, loads=("motion", "sliding")))
+    state = replace(strained("triangles", 0.0), gravity=torch.zeros(2, dtype=torch.float64))
+    after = state.pos.numpy().copy()
+    after[:, 0] = after[:, 0].mean() + 1.05 * (after[:, 0] - after[:, 0].mean())
+    held = np.zeros(after.shape, bool)
+    held[:, 0] = True  # the other axis stays free, where nothing moves the nodes
+    path = np.stack([state.pos.numpy(), after, after])
+    first = replace(state, velocity_history=None, loads=Loads(held, path))
+    torch.manual_seed(0)
+    model = GPE(build.spec, hidden_channels=8, num_message_passing_steps=1, stress=True, stress_unit="strain")
+    scale = model.strain_scale
+    assert isinstance(scale, StrainScale)
+    second = first.later(build.metadata.frame_dt, torch.from_numpy(after), torch.from_numpy((after - path[0]) / build.metadata.frame_dt))
+    for now in (first, second):  # in the second frame, the nodes stay where they are
+        graph = build(now)
+        store = graph[SOLID]
+        still = {SOLID: torch.zeros(len(after), 2)}
+        cells = cells_at_rest(SOLID, store.cell_index, store.rest_pos, store.mass, None)
+        factor = scale(graph, still, {SOLID: torch.ones(len(after), 4)})[SOLID]
+        way = torch.from_numpy(after) - now.pos
+        expected = rms_strain(store.body_pos.double() + way, cells) / FIRST_GUESS
+        assert float(expected) > 0.5
+        torch.testing.assert_close(factor, expected.float().expand(factor.shape), rtol=1e-4, atol=1e-5)
 
 
 def test_what_it_learns_is_the_stress_per_strain_and_no_positions() -> None:
