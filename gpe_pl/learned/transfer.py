@@ -260,8 +260,11 @@ def _copy_statistics(new: LearnedSimulator, trained: LearnedSimulator, sources: 
         elif own.mean.shape == source.mean.shape:
             own.load_state_dict(source.state_dict())
     new.acceleration_std.copy_(trained.acceleration_std)
-    if all(material == source for material, source in sources.items()):  # masses and stresses of others have other units
+    known = [material for material, source in sources.items() if material == source]
+    if known:  # their weights are for the trained units; without known materials, masses and stresses may have other units
         new.standardizer.mass.copy_(trained.standardizer.mass)
+    with_stress = trained.builder.spec.stress_channels
+    if len(known) == len(sources) or any(material in with_stress for material in known):
         new.stress_std.copy_(trained.stress_std)
     new.forget_known_statistics()
 

@@ -229,6 +229,50 @@ def test_a_law_that_goes_on_is_not_changed() -> None:
     torch.testing.assert_close(new.model.state_dict(), trained.model.state_dict(), rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("decoder", ["node", "pair"])
+def test_a_known_material_moves_as_before_beside_a_heavier_new_one(decoder: str) -> None:
+    trained, new = simulator(SAND, decoder=decoder), simulator(scenes.metadata(("sand", "fluid")), 1, decoder=decoder)
+    new.standardizer.mass.mul_(3.0)
+    trained.clamps_parameters = new.clamps_parameters = False
+    with torch.no_grad():
+        for parameter in trained.model.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    new.start_from(trained)
+    state, names = scenes.state(seed=5).to_torch(), new.builder.metadata.param_names
+    params = torch.full((state.num_nodes, len(names)), torch.nan, dtype=torch.float64)
+    params[:, names.index("friction_angle")] = state.material_params[:, 0]
+    known = acceleration(trained, state)
+    found = new(new.builder(replace(state, material_params=params))).acceleration["sand"] * new.acceleration_std
+    assert float(known.detach().abs().max()) > 0.1
+    torch.testing.assert_close(found, known, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("others", [("elastomer",), ("elastomer", "sand")])
+def test_the_law_of_a_known_material_beside_new_ones_keeps_its_motion_and_stress(others: tuple[str, ...]) -> None:
+    with_stress = {**LAW, "stress": True, "only_contacts": False, "island_momentum": "linear"}
+    trained = simulator(SOLID, config=CELLS, **with_stress)
+    new = simulator(scenes.metadata(("solid", *others)), 1, CELLS, **with_stress)
+    new.standardizer.mass.mul_(3.0)
+    trained.stress_std.fill_(50.0)
+    new.stress_std.fill_(2e4)
+    trained.clamps_parameters = new.clamps_parameters = False
+    for one in (trained, new):
+        one.set_units_of(one.model)
+    with torch.no_grad():
+        for parameter in trained.model.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
+    new.start_from(trained)
+    state = scenes.mesh_state("triangles", ("solid",), seed=5)
+    state = replace(state, pos=state.pos + 1e-3 * np.random.default_rng(0).normal(size=state.pos.shape)).to_torch()
+    names = new.builder.metadata.param_names
+    params = torch.full((state.num_nodes, len(names)), torch.nan, dtype=torch.float64)
+    params[:, names.index(E)] = state.material_params[:, 0]
+    before, after = trained.step(state), new.step(replace(state, material_params=params))
+    assert before.stress is not None and after.stress is not None and float(before.stress.node.abs().max()) > 1.0
+    torch.testing.assert_close(after.vel, before.vel, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(after.stress.node, before.stress.node, rtol=1e-3, atol=1e-4 * float(before.stress.node.abs().max()))
+
+
 def test_ranges_of_known_parameters_cover_both_trainings() -> None:
     """Also if the data store other parameters besides."""
     trained = simulator(SAND)
