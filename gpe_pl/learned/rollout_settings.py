@@ -19,6 +19,11 @@ class RolloutSettings(TypedDict, total=False):
     least_distance: float | None
 
 
+def to_store(static_friction: float, mirror_average: bool, least_distance: float) -> dict[str, Any]:
+    """Return the settings that ``stored`` reads, of a simulator at the spacing of its reference."""
+    return {"static_friction": static_friction, "mirror_average": mirror_average, "least_distance": least_distance}
+
+
 def stored(values: Mapping[str, Any]) -> RolloutSettings:
     """Return the settings in the description of a simulator. Older descriptions lack some, which are then off.
 

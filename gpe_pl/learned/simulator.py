@@ -526,9 +526,7 @@ class LearnedSimulator(nn.Module):
             "settings": dict(self.model.settings),
             "graph": asdict(self.builder.config),
             "metadata": asdict(self.builder.reference or self.builder.metadata),
-            "static_friction": self.static_friction,
-            "mirror_average": self.mirror_average,
-            "least_distance": self.least_distance,
+            **rollout_settings.to_store(self.static_friction, self.mirror_average, self.least_distance / self.builder.scales.length_ratio),
             "stride": self.stride,
         }
 

@@ -169,6 +169,17 @@ def test_a_copy_at_another_scale_is_saved_as_the_model_itself(tmp_path: Path) ->
     assert torch.equal(loaded.at(0.08, 0.01).step(s).pos, simulator.at(0.08, 0.01).step(s).pos)
 
 
+def test_a_copy_at_another_scale_stores_the_least_distance_of_the_model_itself(tmp_path: Path) -> None:
+    simulator = learned(built())
+    simulator.trained_scales.copy_(torch.tensor([[0.05, 0.005], [0.1, 0.02]]))
+    simulator.least_distance = 0.02
+    copied = simulator.at(0.1, 0.01)
+    assert copied.least_distance == 0.04
+    copied.save(tmp_path / "model.ckpt")
+    loaded = LearnedSimulator.from_checkpoint(tmp_path / "model.ckpt")
+    assert loaded.least_distance == 0.02 and loaded.at(0.1, 0.01).least_distance == 0.04
+
+
 @pytest.mark.parametrize("column", [0, 1])
 def test_a_checkpoint_with_a_reversed_range_of_scales_is_refused(tmp_path: Path, column: int) -> None:
     simulator = learned(built())
