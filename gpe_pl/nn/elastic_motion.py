@@ -213,7 +213,7 @@ def elastic_motion(
         pos: positions at the start [m].
         vel: velocities at the start [m/frame].
         forcing: accelerations by everything but cells and walls [m/frame²].
-        mass: masses of the nodes.
+        mass: masses of the nodes. Derivatives with respect to them need the plain pass, which is slower.
         law: constants of each cell.
         cells: the cells.
         walls: planes that nodes do not enter.
@@ -237,7 +237,7 @@ def elastic_motion(
         soft = touching.softened(mass.double(), of_node, vel.double())
         contacts = (normal, gap, walls.friction, layer, corners.point, corners.friction, soft.way, soft.law)
         values = [t.double() for t in (pos, vel, forcing, axis_mass, *softened, *contacts)]
-        move: Any = _Motion.apply if works_on(*values) else plain_motion
+        move: Any = _Motion.apply if works_on(*values) and not axis_mass.requires_grad else plain_motion
         displacement, velocity = move(*values, corners.nodes, soft.nodes, cells, number)
         again = _unstable(vel, forcing, layer, displacement, velocity, cells, number)
         again &= (number < MAX_SUBSTEPS) | (level + 1 < len(SOFTER))
@@ -364,7 +364,9 @@ def _stopped_by_corners(velocity: Tensor, y: Tensor, mass: Tensor, corners: Sequ
     for one in corners:
         ends = one.nodes.T
         with torch.no_grad():
-            n, place, least, stop, factors = _corner_contact(y[ends], velocity[ends], one, mass.amin(dim=1)[ends], step[ends[0]])
+            n, place, least, stop, hits = _corner_contact(y[ends], velocity[ends], one, step[ends[0]])
+        weight, inertia = torch.stack([1 - place, place]), mass.amin(dim=1)[ends][:, :, None]
+        factors = torch.where(hits, weight / inertia / (weight.square() / inertia).sum(dim=0), 0.0)
         here = (1 - place) * velocity[ends[0]] + place * velocity[ends[1]]
         along = (here * n).sum(dim=1, keepdim=True)
         change = (along - least) * n + stop * (here - along * n)
@@ -376,14 +378,13 @@ def _corner_contact(
     y: Float[Tensor, "2 pair dim"],
     velocity: Float[Tensor, "2 pair dim"],
     corners: Corners,
-    mass: Float[Tensor, "2 pair"],
     step: Float[Tensor, " pair"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Compute contacts of corners with edges. Where there is none, all results are zero.
 
     Returns:
         Normal of the edge [pair, dim], place on the edge as a fraction of it [pair, 1], allowed velocity along the normal [pair, 1] in m/frame, fraction of the
-        tangential velocity that stops [pair, 1], and factors that distribute the change of velocity to both ends [2, pair, 1].
+        tangential velocity that stops [pair, 1], and whether there is a contact [pair, 1].
     """
     d, from_first = y[1] - y[0], corners.point - y[0]
     square = d.square().sum(dim=1)
@@ -398,11 +399,9 @@ def _corner_contact(
     hits = (place >= 0) & (place <= 1) & (height > -DEEPEST * length) & (excess > 0)
     tangential = (here - along[:, None] * n).norm(dim=1)
     stop = (corners.friction * excess / tangential.clamp(min=1e-300)).clamp(max=1.0)
-    weight = torch.stack([1 - place, place])
-    factors = weight / mass / (weight.square() / mass).sum(dim=0)
-    found = (n, place[:, None], least[:, None], stop[:, None], factors[:, :, None])
     where = hits[:, None]
-    return tuple(torch.where(where, value, 0.0) for value in found)  # type: ignore[return-value]
+    n, place, least, stop = (torch.where(where, value, 0.0) for value in (n, place[:, None], least[:, None], stop[:, None]))
+    return n, place, least, stop, where
 
 
 def _internal(y: Tensor, velocity: Tensor, law: Law, cells: Cells) -> Tensor:

@@ -12,9 +12,11 @@ REST = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=torc
 LAW = (torch.tensor([0.3]).double(), torch.tensor([0.2]).double(), torch.tensor([0.01]).double())
 
 
-def moved(pos: Tensor, vel: Tensor, forcing: Tensor, point: Tensor, friction: float, copies: int = 1) -> tuple[Tensor, Tensor]:
+def moved(
+    pos: Tensor, vel: Tensor, forcing: Tensor, point: Tensor, friction: float, copies: int = 1, mass: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Return the motion of copies of a square, with a corner at ``point`` below its lowest edge."""
-    mass, scene = torch.full((4 * copies,), 0.25).double(), torch.arange(copies).repeat_interleave(4)
+    mass, scene = torch.full((4 * copies,), 0.25).double() if mass is None else mass, torch.arange(copies).repeat_interleave(4)
     nodes = torch.arange(4 * copies).reshape(copies, 4)
     cells = Cells.of(nodes, REST.repeat(copies, 1), mass, scene)
     walls = Walls(torch.zeros_like(pos), torch.zeros_like(mass), torch.zeros_like(mass))
@@ -71,6 +73,18 @@ def test_the_compiled_pass_equals_the_plain_one() -> None:
         assert torch.allclose(a, b, rtol=1e-10, atol=1e-12)
     free, _ = moved(inputs[0], inputs[1], inputs[2], torch.tensor([[0.4, -50.0]]).double(), 0.3, copies=3)
     assert not torch.allclose(free, compiled[0])
+
+
+def test_gradients_of_masses_pass_contacts_of_corners() -> None:
+    """A corner beside the middle of an edge turns the body, which depends on the masses at both ends. The place on the edge counts as constant."""
+    vel, nothing = torch.tensor([[0.05, -0.2]]).double().expand(4, 2), torch.zeros(4, 2).double()
+
+    def of(mass: Tensor) -> Tensor:
+        return moved(REST, vel, nothing, torch.tensor([[0.3, -0.19]]).double(), 0.3, mass=mass)[1]
+
+    mass = torch.tensor([0.2, 0.3, 0.25, 0.25]).double().requires_grad_()
+    assert (of(mass) - of(2.0 * mass)).abs().max() > 1e-3
+    assert torch.autograd.gradcheck(of, mass, eps=1e-6, atol=2e-3, rtol=0)
 
 
 def test_contacts_that_share_nodes_follow_each_other_in_both_passes() -> None:

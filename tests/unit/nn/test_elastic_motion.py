@@ -159,7 +159,7 @@ def test_the_compiled_motion_and_its_gradients_equal_the_plain_ones(kind: str) -
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_are_those_of_finite_differences(kind: str) -> None:
     _, together = several(kind, 1)
-    names = ("pos", "vel", "forcing", "lam", "mu", "eta", "gap", "friction", "way")
+    names = ("pos", "vel", "forcing", "mass", "lam", "mu", "eta", "gap", "friction", "way")
 
     def of(*inputs: Tensor) -> tuple[Tensor, Tensor]:
         return motion(together | dict(zip(names, inputs, strict=True)))
