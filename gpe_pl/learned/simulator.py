@@ -40,7 +40,7 @@ from gpe_pl.learned.next_states import Rows
 from gpe_pl.learned.pretrained import checkpoint_path
 from gpe_pl.learned.rollout_settings import RolloutSettings
 from gpe_pl.learned.start_checks import SceneError as SceneError
-from gpe_pl.learned.start_checks import check_start, inside_obstacles
+from gpe_pl.learned.start_checks import check_derivatives, check_start, inside_obstacles
 from gpe_pl.learned.transfer import Transfer
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
@@ -416,6 +416,7 @@ class LearnedSimulator(nn.Module):
 
         States may be on the host while the model is on another device.
         """
+        check_derivatives(self.model, states, self.spacing)
         new: list[Any] = [self.builder.topology_or_error(state) for state in states]
         kept = [k for k, topology in enumerate(new) if not isinstance(topology, SimulationError)]
         if kept:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import torch
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.shapes import signed_distance
+from gpe_pl.graphs.contacts import convex_corners
 from gpe_pl.graphs.features import history_of
+from gpe_pl.models.base import Model
 from gpe_pl.rollout.guard import unsound
 from gpe_pl.schema import LARGEST, node_code
 from gpe_pl.trajectory.state import State
@@ -20,6 +22,32 @@ DEEPEST = 0.5
 
 class SceneError(GpeError, ValueError):
     """Raised when a scene does not fit a trained simulator, or has invalid values."""
+
+
+class DerivativeError(GpeError, ValueError):
+    """Raised instead of gradients that would be wrong."""
+
+
+def check_derivatives(model: Model, states: Iterable[State], spacing: float) -> None:
+    """Check that gradients of a step are right with respect to boundary nodes. The elastic law takes walls from shapes, which have no gradients.
+
+    Args:
+        model: model of the step.
+        states: states of the scenes, as tensors.
+        spacing: rest spacing [m].
+
+    Raises:
+        DerivativeError: the model has the elastic law, boundary nodes need gradients, and the scene has shapes, corners, or normals that need gradients.
+    """
+    if not torch.is_grad_enabled() or not model.settings.get("elastic"):
+        return
+    for boundary in (state.boundary for state in states):
+        sought = [name for name in ("pos", "normal", "friction") if getattr(boundary, name).requires_grad]
+        if sought and (boundary.shapes or "normal" in sought or (boundary.pos.shape[1] == 2 and len(convex_corners(boundary, spacing)))):
+            raise DerivativeError(
+                f"boundary {', '.join(sought)}: models with model.elastic=true have no gradients with respect to walls and obstacles; "
+                "use finite differences, or detach these tensors"
+            )
 
 
 def check_start(state: State, metadata: Metadata, where: str) -> None:

@@ -15,6 +15,8 @@ from gpe_pl.export.program import EVERYTHING
 from gpe_pl.geometry.relief import reliefs
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.graphs.contacts import corners_near_edges, oriented_edges
+from gpe_pl.learned.differentiable import Differentiable
+from gpe_pl.learned.start_checks import DerivativeError
 from gpe_pl.models.gpe import GPE
 from gpe_pl.system.compiled import unfused
 from gpe_pl.trajectory.boundary import Boundary
@@ -113,6 +115,25 @@ def test_the_way_to_a_corner_has_the_derivative_of_the_position() -> None:
     assert len(corner)
     (grad,) = torch.autograd.grad(corner[:, :2].sum(), pos)
     torch.testing.assert_close(grad, -torch.bincount(ends[:, 0], minlength=len(pos)).double()[:, None].expand_as(grad))
+
+
+@pytest.mark.parametrize("name", ["pos", "normal", "friction"])
+def test_gradients_of_walls_are_refused_because_shapes_have_none(name: str) -> None:
+    simulated, state = Differentiable(simulator(("solid",))), beside_an_obstacle(0, "triangles", 1)
+    sought = {name: getattr(state.boundary, name).clone().requires_grad_()}
+    without = replace(state.boundary, shapes=())  # its corners are no less constant
+    for boundary in (state.boundary, without):
+        seeking = replace(state, boundary=replace(boundary, **sought))
+        with pytest.raises(
+            DerivativeError, match=f"boundary {name}: models with model.elastic=true have no gradients with respect to walls"
+        ):
+            simulated.step(seeking)
+        with torch.no_grad():
+            simulated.step(seeking)
+    flat = Boundary.sample(domain_walls(((-1.0, 2.0),) * 2, 0.3), scenes.SPACING, 2)
+    flat = replace(state, boundary=replace(flat, shapes=())).to_torch().boundary
+    flat = replace(flat, pos=flat.pos.clone().requires_grad_())
+    simulated.step(replace(state, boundary=flat))  # the planes of boundary nodes move with these
 
 
 @pytest.mark.parametrize("num_bodies", [1, 2])

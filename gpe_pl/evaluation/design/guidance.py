@@ -17,6 +17,7 @@ from torch import Tensor
 from gpe_pl.evaluation.design.pose import NAMES, Obstacle
 from gpe_pl.evaluation.rollout_scores import rollout_scores
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.start_checks import DerivativeError
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata
 
@@ -68,12 +69,15 @@ class Guidance:
             return float(self._misfit(torch.tensor(np.asarray(z, dtype=np.float64))))
 
     def misfit_and_gradient(self, z: Sequence[float] | np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the misfit and its gradient. The gradient of a rollout that fails is zero."""
+        """Return the misfit and its gradient. The gradient of a rollout that fails is zero, and that of a model without gradients is not a number."""
         self.num_gradients += 1
         at = torch.tensor(np.asarray(z, dtype=np.float64), requires_grad=True)
         with torch.enable_grad():
             misfit = self._misfit(at)
-            gradient = torch.autograd.grad(misfit, at)[0].numpy() if misfit.requires_grad else np.zeros(len(at))
+            try:
+                gradient = torch.autograd.grad(misfit, at)[0].numpy() if misfit.requires_grad else np.zeros(len(at))
+            except DerivativeError:
+                gradient = np.full(len(at), np.nan)
         return float(misfit.detach()), gradient
 
     def _misfit(self, z: Tensor) -> Tensor:

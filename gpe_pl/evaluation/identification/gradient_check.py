@@ -53,6 +53,8 @@ class GradientCheck:
         return 1 / LARGEST_RATIO <= self.gradient / self.difference <= LARGEST_RATIO
 
     def __str__(self) -> str:
+        if np.isnan(self.gradient):
+            return "the model has no gradients here; a derivative-free search takes their place"
         numbers = f"{self.gradient:.3g} by automatic differentiation, {self.difference:.3g} by finite differences"
         if self.is_trusted:
             return f"gradients are trusted: the slope of the misfit is {numbers}"

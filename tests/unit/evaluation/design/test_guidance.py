@@ -18,7 +18,7 @@ from gpe_pl.geometry.shapes import Box, Polygon, Sphere, Wall, domain_walls
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.trajectory.boundary import Boundary
-from tests import scenes
+from tests import elastic, scenes
 from tests.unit.training.test_unroll_gradients import Double, simulator_of, slow, unroll
 
 WALLS = domain_walls(((0.0, 1.0),) * 2, 0.3)
@@ -75,6 +75,18 @@ def test_a_rollout_that_fails_counts_as_failed(guidance: Guidance) -> None:
     broken = replace(guidance, state=replace(guidance.state, vel=guidance.state.vel * 1e15))
     value, gradient = broken.misfit_and_gradient([0.5, 0.5, 0.5])
     assert value == pytest.approx(math.log(100.0)) and not gradient.any()
+
+
+def test_a_model_without_gradients_of_walls_is_searched_without_them() -> None:
+    """Models with the elastic law take walls from shapes."""
+    simulator = elastic.simulator()
+    state = replace(elastic.bodies(), boundary=torch_boundary(boundary(RAMP)))
+    metadata = simulator.builder.metadata
+    guidance = Guidance(simulator, state, metadata, Obstacle.of(RAMP, boundary(RAMP)), (0.02, 0.03, 0.1), np.array([0.2, 0.1]), 2, 100.0)
+    value, gradient = guidance.misfit_and_gradient([0.5, 0.5, 0.5])
+    assert value == pytest.approx(guidance.misfit([0.5, 0.5, 0.5]), rel=1e-6) and np.isnan(gradient).all()
+    found = search(guidance, SearchSettings(method="gradient", num_scanned=3, max_evaluations=3, profile_evaluations=0))
+    assert found.method == "derivative_free" and str(found.check).startswith("the model has no gradients here")
 
 
 @pytest.mark.parametrize("shape", [RAMP, BOX, DISC])
