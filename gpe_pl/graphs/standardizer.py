@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.graphs.features import ParameterScale
 from gpe_pl.graphs.standards import ParameterStandards, Standards
 from gpe_pl.nn.blocks import Standardize
+from gpe_pl.nn.pointers import checksum, count_words
 from gpe_pl.schema import RADIUS, EdgeType, FeatureSpec, role
 
 
@@ -51,6 +52,24 @@ class StatisticsSample:
         return iter(self.graphs)
 
 
+class _Kept(NamedTuple):
+    """Statistics as arrays, and what tells whether they are current.
+
+    Attributes:
+        addresses: addresses of the tensors.
+        memory: the addresses, and the numbers of words of four bytes there, as ``pointers.checksum`` takes them.
+        checksum: checksum of this memory.
+        tensors: the tensors, which are kept so that no others get their addresses.
+        standards: the statistics.
+    """
+
+    addresses: list[int]
+    memory: tuple[np.ndarray, np.ndarray]
+    checksum: int
+    tensors: list[Tensor]
+    standards: Standards
+
+
 class GraphStandardizer(nn.Module):
     """Standardises every feature of a graph with training statistics. Odd edge channels are only scaled, so they stay odd. Masses are divided by their mean.
 
@@ -72,7 +91,7 @@ class GraphStandardizer(nn.Module):
         self.even = nn.ModuleDict({self._key(r): Standardize(spec.even_channels[r]) for r in spec.relations})
         self.register_buffer("mass", torch.ones(()))
         self._buffers_of_all = [module._buffers for module in self.modules()]
-        self._standards: tuple[list[Any], list[Tensor], Standards] | None = None
+        self._standards: _Kept | None = None
 
     @staticmethod
     def _key(relation: EdgeType) -> str:
@@ -143,16 +162,17 @@ class GraphStandardizer(nn.Module):
     def standards(self, limits: dict[str, Tensor] | None = None) -> Standards:
         """Return the statistics as arrays for compiled features on the CPU. They are kept until a statistic changes.
 
+        Each call compares a checksum of all statistics, because PyTorch does not count changes through ``data``, NumPy or in inference mode.
+
         Args:
             limits: as in ``forward``.
         """
         tensors = [t for buffers in self._buffers_of_all for t in buffers.values() if t is not None] + [*(limits or {}).values()]
-        if any(t.is_inference() for t in tensors):  # their changes are not counted
-            return self._new_standards(limits)
-        versions = [(id(t), t._version) for t in tensors]
-        if self._standards is None or self._standards[0] != versions:
-            self._standards = versions, tensors, self._new_standards(limits)  # keeps the tensors, so that no other gets their id
-        return self._standards[2]
+        addresses, kept = [*map(Tensor.data_ptr, tensors)], self._standards
+        if kept is None or kept.addresses != addresses or checksum(*kept.memory) != kept.checksum:
+            memory = np.array(addresses, np.int64), np.array([*map(count_words, tensors)], np.int64)
+            kept = self._standards = _Kept(addresses, memory, checksum(*memory), tensors, self._new_standards(limits))
+        return kept.standards
 
     def _new_standards(self, limits: dict[str, Tensor] | None) -> Standards:
         def statistics(module: nn.Module) -> tuple[np.ndarray, np.ndarray]:

@@ -27,7 +27,7 @@ from gpe_pl.nn.encoders import MaterialEmbedding, OddEncoder
 from gpe_pl.nn.momentum_conv import MomentumConv
 from gpe_pl.nn.network_program import Executable, Tables
 from gpe_pl.nn.pair_force import PairForce
-from gpe_pl.nn.pointers import checksum
+from gpe_pl.nn.pointers import checksum, count_words
 from gpe_pl.nn.stores import contents
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import is_symmetric
@@ -85,7 +85,7 @@ class GPEProgramRunner:
         self._owners, self._names, self._parts = ([*column] for column in zip(*parts, strict=True))
         self._weights = [part for part in self._parts if isinstance(part, Tensor)]
         self._addresses = [*map(Tensor.data_ptr, self._weights)]
-        self._places, self._words = np.array(self._addresses, np.int64), np.array([*map(_num_words, self._weights)], np.int64)
+        self._places, self._words = np.array(self._addresses, np.int64), np.array([*map(count_words, self._weights)], np.int64)
         self._checksum = checksum(self._places, self._words)
         if self._unknown is not None:
             return
@@ -207,12 +207,6 @@ class GPEProgramRunner:
 
 class _UnexpectedError(Exception):
     """A tensor of another precision, device or shape than the weights."""
-
-
-def _num_words(weight: Tensor) -> int:
-    """Return the number of words of four bytes from the first to the last value of a tensor in memory."""
-    extent = 1 + sum((size - 1) * step for size, step in zip(weight.shape, weight.stride(), strict=True))
-    return extent * weight.element_size() // 4 if weight.numel() else 0
 
 
 def _table(rows: list[Any], columns: int) -> np.ndarray:

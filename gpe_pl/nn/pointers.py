@@ -7,6 +7,7 @@ from typing import no_type_check
 import numpy as np
 from numba import carray, njit, types
 from numba.extending import intrinsic
+from torch import Tensor
 
 
 @intrinsic
@@ -33,6 +34,12 @@ def row_of(matrix, row, column, count):
     """Return some columns of a row. Loops over them vectorise, unlike loops over ``matrix[row, column + c]``, whose index might be negative."""
     address = matrix.ctypes.data + matrix.itemsize * (row * matrix.shape[1] + column)
     return carray(pointer(address), (count,), matrix.dtype)
+
+
+def count_words(tensor: Tensor) -> int:
+    """Return the number of words of four bytes from the first to the last value of a tensor in memory."""
+    extent = 1 + sum((size - 1) * step for size, step in zip(tensor.shape, tensor.stride(), strict=True))
+    return extent * tensor.element_size() // 4 if tensor.numel() else 0
 
 
 @njit(cache=True, nogil=True)

@@ -265,6 +265,14 @@ def test_changed_statistics_are_seen() -> None:
     torch.testing.assert_close(x[1], x[0] - (1 / sand.std).float())
     assert x[2].dtype == torch.float64
     torch.testing.assert_close(x[2].float(), x[1])
+    for change in (sand.mean.data.add_, sand.mean.numpy().__iadd__):  # PyTorch does not count these
+        change(1.0)
+        x.append(standardized())
+        torch.testing.assert_close(x[-1], x[-2] - 1 / sand.std)
+    with torch.inference_mode():
+        sand.mean += 1.0
+        x.append(standardized())
+    torch.testing.assert_close(x[-1], x[-2] - 1 / sand.std)
 
 
 @pytest.mark.slow
