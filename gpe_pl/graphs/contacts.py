@@ -146,11 +146,13 @@ def oriented_edges(rest_pos: Float64[Tensor, "node 2"], cells: Int64[Tensor, "ce
 
 
 def convex_corners(boundary: Boundary, spacing: float) -> np.ndarray:
-    """Return the rows of boundary nodes in 2D that are convex corners. The result is cached, because the positions of a ``Boundary`` never change."""
-    kept: dict[float, np.ndarray] = boundary.__dict__.setdefault("_corners", {})  # not a field, so neither compared nor stored
-    if spacing not in kept:
-        kept[spacing] = _convex_corners(as_numpy(boundary.pos), as_numpy(boundary.normal).astype(np.float64), spacing)
-    return kept[spacing]
+    """Return the rows of boundary nodes in 2D that are convex corners. The result is cached with the boundary."""
+
+    def find() -> np.ndarray:
+        return _convex_corners(as_numpy(boundary.pos), as_numpy(boundary.normal).astype(np.float64), spacing)
+
+    found: np.ndarray = boundary.made_once(("corners", spacing), find)
+    return found
 
 
 def _convex_corners(pos: np.ndarray, normal: np.ndarray, spacing: float) -> np.ndarray:

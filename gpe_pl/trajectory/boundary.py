@@ -239,15 +239,29 @@ class Boundary:
         return self if self.motion is None else replace(self, motion=self.motion.every(stride)).at(0)
 
     def tree(self, periodicity: Periodicity) -> Any:
-        """Return ``search_tree`` of the positions. It is built once, because the positions of a ``Boundary`` never change."""
+        """Return ``search_tree`` of the positions. It is cached."""
         return self.made_once(periodicity, lambda: search_tree(self.pos, periodicity))
 
     def made_once(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """Return ``make()``, computed at the first call with this key and then cached with the boundary."""
-        kept: dict[Hashable, Any] = self.__dict__.setdefault("_made", {})  # not a field, so neither compared nor stored
+        """Return ``make()``, computed at the first call with this key and then cached with the boundary.
+
+        Changes in place that PyTorch counts, such as ``pos[:, 1] += 0.1``, empty the cache. Others are not seen: those of arrays, through ``pos.data``, and of
+        tensors of inference mode.
+        """
+        versions = [_version(x) for x in (self.pos, self.vel, self.normal)]
+        kept: dict[Hashable, Any]
+        found, kept = self.__dict__.setdefault("_made", (versions, {}))  # not a field, so neither compared nor stored
+        if found != versions:
+            kept = {}
+            self.__dict__["_made"] = versions, kept
         if key not in kept:
             kept[key] = make()
         return kept[key]
+
+
+def _version(x: Array) -> int:
+    """Return how often a tensor was changed in place; 0 for arrays, and for tensors whose changes are not counted."""
+    return 0 if isinstance(x, np.ndarray) or x.is_inference() else int(x._version)
 
 
 def search_tree(pos: Array, periodicity: Periodicity = NOWHERE) -> Any:
