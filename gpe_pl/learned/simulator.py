@@ -430,6 +430,8 @@ class LearnedSimulator(nn.Module):
         mass = self.standardizer.mass
         if mass.is_cuda or mass.dtype != self.builder.precision or not all(map(works_on, states)):
             return None
+        if self.static_friction and torch.is_grad_enabled():
+            return None  # predictions can need gradients, which compiled static friction does not have
         if self.static_friction and any(bool(state.boundary.vel.any()) or state.rigid_body is not None for state in states):
             return None  # static friction reads from the graph which walls move, and keeps rigid bodies as a whole
         return self.standardizer.standards(dict(self.trained_ranges()) if self.clamps_parameters else None)

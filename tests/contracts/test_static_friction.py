@@ -15,6 +15,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.standards import Standards
 from gpe_pl.graphs.topology import Topology
+from gpe_pl.learned.differentiable import Differentiable
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator, SceneError
 from gpe_pl.models.base import Prediction
 from gpe_pl.models.gpe import GPE
@@ -73,6 +74,17 @@ def test_what_lies_on_a_wall_stays_and_what_flies_falls(materials: tuple[str, ..
     assert not held.vel[lies].any() and held.velocity_history is not None and not held.velocity_history[lies].any()
     assert torch.equal(held.pos[~lies], free.pos[~lies]) and torch.equal(held.vel[~lies], free.vel[~lies])
     assert free.vel[lies].any()
+
+
+def test_steps_for_training_from_states_without_gradients_keep_the_same_nodes() -> None:
+    learned = simulator()
+    learned.model.register_parameter("weight", torch.nn.Parameter(torch.zeros(())))
+    learned.model.register_forward_hook(lambda model, _, found: Prediction({m: a + model.weight for m, a in found.acceleration.items()}))
+    learned.static_friction = ENOUGH
+    state, lies = lying_and_flying()
+    after, expected = Differentiable(learned).step(state.to_torch()), learned.step(state.to_torch())
+    assert after.pos.requires_grad and not after.vel[lies].any()
+    torch.testing.assert_close(after.pos.detach(), expected.pos)
 
 
 def test_features_are_compiled_unless_a_wall_moves(monkeypatch: pytest.MonkeyPatch) -> None:
