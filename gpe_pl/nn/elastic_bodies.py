@@ -206,7 +206,8 @@ class ElasticBodies(nn.Module):
             raise CellError("PyTorch Geometric's Batch does not renumber cells; join graphs with gpe_pl.graphs.batching.batched")
         if is_wanted() and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
             return self._moved_at_once(m, data, acceleration, params, mass, with_stress)
-        own = data[m].body_pos.new_empty(len(mass), 0) if params is None else params.to(data[m].body_pos.dtype)
+        weight = cast(Constants, self.constants[m]).logarithm["weight"]  # can have another precision than the graph
+        own = weight.new_empty(len(mass), 0) if params is None else params.to(weight.dtype)
         constants = cast(Constants, self.constants[m])(own)
         # an H200 needs 0.1 to 0.4 s to start the operations of all substeps one by one; the compiled pass on the host takes 1 ms with both copies
         device = torch.device("cpu") if is_wanted() else mass.device

@@ -23,6 +23,7 @@ from gpe_pl.graphs.builder import GraphBuilder, GraphError
 from gpe_pl.graphs.elastic_cells import attaching_cells
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.approximate import Repeating, Sleeping
+from gpe_pl.learned.differentiable import Differentiable
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn import elastic_motion
@@ -261,6 +262,13 @@ def test_the_embedding_decides_whether_the_law_reads_the_parameter() -> None:
     for embedding, reads in (("affine", True), ("none", False)):
         simulated = simulator(network=0.0, material_embedding=embedding)
         assert torch.equal(simulated.step(state).pos, simulated.step(other).pos) != reads
+
+
+def test_models_in_double_precision_have_gradients() -> None:
+    precise, state = simulator().double(), bodies()
+    after, expected = Differentiable(precise).step(state), precise.step(state)
+    assert after.pos.requires_grad and after.frame_velocity is not None and expected.frame_velocity is not None
+    assert_close((after.pos.detach(), after.frame_velocity.detach()), (expected.pos, expected.frame_velocity))
 
 
 def test_the_loss_reaches_the_network_and_the_constants() -> None:
