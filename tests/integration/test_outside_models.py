@@ -50,5 +50,5 @@ def test_the_contract_can_be_checked_from_outside(tmp_path: Path) -> None:
     with outside.installed(outside.write(tmp_path / "site")):
         make = factory(model_class("outside_gpe.net.Net"), hidden_channels=4)
         for name, check in CHECKS.items():
-            if name != "gradients":  # needs a model that reads edges
+            if name not in ("gradients", "walls without features"):  # need a model that reads edges
                 check(make)

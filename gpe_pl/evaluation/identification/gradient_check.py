@@ -54,7 +54,7 @@ class GradientCheck:
 
     def __str__(self) -> str:
         if np.isnan(self.gradient):
-            return "the model has no gradients here; a derivative-free search takes their place"
+            return "gradients cannot be trusted: the model has none here; a derivative-free search takes their place"
         numbers = f"{self.gradient:.3g} by automatic differentiation, {self.difference:.3g} by finite differences"
         if self.is_trusted:
             return f"gradients are trusted: the slope of the misfit is {numbers}"

@@ -86,7 +86,7 @@ def test_a_model_without_gradients_of_walls_is_searched_without_them() -> None:
     value, gradient = guidance.misfit_and_gradient([0.5, 0.5, 0.5])
     assert value == pytest.approx(guidance.misfit([0.5, 0.5, 0.5]), rel=1e-6) and np.isnan(gradient).all()
     found = search(guidance, SearchSettings(method="gradient", num_scanned=3, max_evaluations=3, profile_evaluations=0))
-    assert found.method == "derivative_free" and str(found.check).startswith("the model has no gradients here")
+    assert found.method == "derivative_free" and "the model has none here" in str(found.check)
 
 
 @pytest.mark.parametrize("shape", [RAMP, BOX, DISC])
