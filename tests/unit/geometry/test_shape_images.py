@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -84,16 +84,17 @@ def test_an_oblique_turn_leaves_no_shapes() -> None:
 
 
 def test_a_boundary_keeps_its_shapes_if_all_have_images() -> None:
-    mirror = Reflection((0.4, None))
+    mirror, other = Reflection((0.4, None)), cast(Any, Unmirrored())
     image = mirror.boundary(Boundary.sample(tuple(SHAPES), 0.05, 2))
     assert len(image.shapes) == len(SHAPES)
-    assert mirror.boundary(Boundary.sample((*SHAPES, Unmirrored()), 0.05, 2)).shapes == ()
+    assert mirror.boundary(Boundary.sample((*SHAPES, other), 0.05, 2)).shapes == ()
 
 
 def test_two_mirror_images_of_a_grid_are_the_grid() -> None:
-    grid, mirror = SHAPES[-1], Reflection((0.5, 0.25))
+    grid, mirror = cast(Any, SHAPES[-1]), Reflection((0.5, 0.25))
     (image,) = mirror.shapes([grid])
-    assert mirror.shapes([image])[0].values.tolist() == grid.values.tolist()
+    again = cast(Any, mirror.shapes([image])[0])
+    assert again.values.tolist() == grid.values.tolist()
 
 
 @pytest.mark.parametrize("shape", [s for s in SHAPES if s.kind != "wall"], ids=lambda shape: shape.kind)
@@ -101,12 +102,12 @@ def test_two_mirror_images_of_a_grid_are_the_grid() -> None:
 def test_repeated_shapes_repeat_their_image(shape: Any, periodic: tuple[bool, bool]) -> None:
     space = Periodicity(BOUNDS, periodic)
     for mirror in (Reflection.of(BOUNDS, [0]), Reflection.of(BOUNDS, [0, 1])):
-        (image,), points = mirror.shapes([Repeated(shape, space)]), np.random.default_rng(0).uniform(-0.2, 0.9, (200, 2))
+        image, points = cast(Any, mirror.shapes([Repeated(shape, space)])[0]), np.random.default_rng(0).uniform(-0.2, 0.9, (200, 2))
         expected = Repeated(shape, space).signed_distance(points)
         np.testing.assert_allclose(image.signed_distance(mirror.point(points)), expected, atol=1e-12)
         assert image.periodicity is space
     turn = next(turn for k in range(4) if (turn := Rotation.between_axes(k, (0.2, 0.5))).matrix[0, 1] == 1)
-    (image,) = turn.shapes([Repeated(shape, space)])
+    image = cast(Any, turn.shapes([Repeated(shape, space)])[0])
     assert image.periodicity.periodic == periodic[::-1]
     np.testing.assert_allclose(image.signed_distance(turn.point(points)), expected, atol=1e-12)
 
