@@ -209,3 +209,21 @@ def test_with_the_papers_recipe_too_an_axis_changes_something_or_is_refused(expe
                 [kept[key] for key in ("data", "graph", "model", "training")] + [values["start_from"], values["evaluation"].get("data")]
             )
     assert all(run not in runs[:k] for k, run in enumerate(runs))
+
+
+def commands_of_suites() -> list[tuple[str, list[str]]]:
+    """Return the commands that suites run themselves, with their overrides."""
+    faults, sets, adaptation = (OmegaConf.load(CONF / "suite" / f"{name}.yaml") for name in ("faults", "learning_sets", "adaptation"))
+    data = [*faults.data]
+    found = [(name, data + [a for a in faults.commands[name].arguments if "{" not in a]) for name in ("simulate", "fit")]
+    imported = ["data=imported", "data.name=own"]
+    found += [("fit", [*imported, *own, "training.budget_minutes=10"]) for own in sets.training.values()]
+    return found + [
+        ("fit", [*imported, *own.training, "training.num_steps=9", "training.learning_rate=1e-3"]) for own in adaptation.engines.values()
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("command", "overrides"), commands_of_suites(), ids=lambda v: v if isinstance(v, str) else "")
+def test_commands_of_suites_are_not_refused(command: str, overrides: list[str]) -> None:
+    assert without_effect(unresolved(*overrides, command=command), overrides) == ""
