@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +12,7 @@ import torch
 from gpe_pl.metrics import energy_distance
 from gpe_pl.rollout.loop import SimulationError, steps
 from gpe_pl.solvers.resolution import Resolved
+from gpe_pl.system.machine import work_clock
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -48,14 +48,12 @@ def timed(simulator: Any, at: Start, data: Trajectory, kept_from: int) -> tuple[
     dt = data.metadata.frame_dt
     first, every = 0 if at.from_start else kept_from, at.frames_per_step
     wanted = data.num_frames - first
-    clock = time.perf_counter if isinstance(start.pos, torch.Tensor) and start.pos.is_cuda else time.process_time
+    clock = work_clock(isinstance(start.pos, torch.Tensor) and start.pos.is_cuda)
     frames, seconds, num_steps = [_numpy(start)], 0.0, 0
     try:
         simulator.step(start)
         begun = clock()
         for state in steps(simulator, start, -(-(wanted - 1) // every)):
-            if isinstance(state.pos, torch.Tensor) and state.pos.is_cuda:
-                torch.cuda.synchronize()
             seconds += clock() - begun
             num_steps += 1
             pos, vel = _numpy(state)

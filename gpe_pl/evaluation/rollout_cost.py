@@ -5,15 +5,14 @@ It is processor time of this process on a CPU, and wall time on a GPU. The two d
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from gpe_pl.files import sealed
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
+from gpe_pl.system.machine import work_clock
 from gpe_pl.trajectory.state import State
 
 COST_FILE = "rollout_cost.json"
@@ -37,23 +36,19 @@ class Timed:
     on_gpu: bool = False
 
     def step(self, state: State) -> State:
-        begun = self._now()
+        clock = work_clock(self.on_gpu)
+        begun = clock()
         new = self.simulator.step(state)
-        self.seconds.append(self._now() - begun)
+        self.seconds.append(clock() - begun)
         return new
 
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        begun = self._now()
+        clock = work_clock(self.on_gpu)
+        begun = clock()
         new = step_all(self.simulator, states)
         count = max(1, len(states))
-        self.seconds.extend([(self._now() - begun) / count] * count)
+        self.seconds.extend([(clock() - begun) / count] * count)
         return new
-
-    def _now(self) -> float:
-        if not self.on_gpu:
-            return time.process_time()
-        torch.cuda.synchronize()
-        return time.perf_counter()
 
 
 @dataclass(frozen=True)

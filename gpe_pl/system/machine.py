@@ -85,6 +85,16 @@ def has_cpp_compiler() -> bool:
     return any(shutil.which(name) for name in ("c++", "g++", "clang++", "cl"))
 
 
+def work_clock(on_gpu: bool) -> Callable[[], float]:
+    """Return a clock [s] for finished work: processor time of all threads on a CPU, which depends less on other processes, and wall time on a GPU."""
+
+    def wall_time() -> float:
+        torch.cuda.synchronize()
+        return time.perf_counter()
+
+    return wall_time if on_gpu else time.process_time
+
+
 def synchronized(function: Callable[[], Any], device: str) -> Callable[[], Any]:
     """Return a function that also waits until the GPU has finished the work; unchanged for other devices."""
     if not device.startswith("cuda"):

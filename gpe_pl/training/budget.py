@@ -10,7 +10,6 @@ import hashlib
 import json
 import logging
 import math
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -18,7 +17,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import lightning as L
-import torch
 from pydantic import Field, TypeAdapter, ValidationError
 
 from gpe_pl.data.augmentation import Augmentation
@@ -27,7 +25,7 @@ from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
 from gpe_pl.files import sealed
 from gpe_pl.system.locks import alone
-from gpe_pl.system.machine import gemm_rate
+from gpe_pl.system.machine import gemm_rate, work_clock
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
 from gpe_pl.training.optimizer import OnePassAdam, clip
 from gpe_pl.training.run import TrainerSettings, TrainingSettings
@@ -118,8 +116,7 @@ def step_time(
         push_forward: settings of push-forward in all steps; None for steps without it.
         limit: time after which no further round begins [s].
     """
-    on_gpu = next(module.parameters()).is_cuda
-    clock = time.perf_counter if on_gpu else time.process_time
+    clock = work_clock(next(module.parameters()).is_cuda)
     optimizer = OnePassAdam(module.parameters(), learning_rate=0.0)
     numbers = BatchSampler(data, size, 0, lambda: 0, push_forward)
     batches = (module.transfer_batch_to_device(collated([data[key] for key in keys]), module.device, 0) for keys in numbers)
@@ -131,8 +128,6 @@ def step_time(
             module.loss(next(batches)).backward()
             clip(module.parameters(), gradient_clip)
             optimizer.step()
-        if on_gpu:
-            torch.cuda.synchronize()
         return clock() - start
 
     with module.compiled():

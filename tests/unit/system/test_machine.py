@@ -42,6 +42,15 @@ def test_a_copy_in_a_repository_of_something_else_has_no_commit(tmp_path: Path, 
     assert commit() == "unknown"
 
 
+def test_a_clock_of_work_on_a_gpu_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    order = list[str]()
+    monkeypatch.setattr("torch.cuda.synchronize", lambda: order.append("finished"))
+    monkeypatch.setattr("time.perf_counter", lambda: order.append("read") or 1.0)  # type: ignore[func-returns-value]
+    monkeypatch.setattr("time.process_time", lambda: 7.0)
+    assert machine.work_clock(on_gpu=True)() == 1.0 and order == ["finished", "read"]
+    assert machine.work_clock(on_gpu=False)() == 7.0 and len(order) == 2
+
+
 def test_rates_are_positive() -> None:
     assert gemm_rate(64, 8, "cpu") > 0 and copy_rate("cpu", 2**16) > 0
 
