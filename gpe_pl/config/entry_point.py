@@ -49,6 +49,7 @@ WITHOUT_KEY = {"adaptation", "comparison", "experiment", "law", "parameters", "r
 
 plugins.register()  # files in conf/ use the plugins
 OmegaConf.register_new_resolver("times", lambda a, b: a * b, replace=True)  # ${times:a,b} in conf/
+OmegaConf.register_new_resolver("plus", lambda a, b: a + b, replace=True)
 OmegaConf.register_new_resolver("model_name", model_name, replace=True)  # ${model_name:checkpoint,runs}
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # ${run_name:name} in conf/ checks the name of a results folder
@@ -185,7 +186,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                 if unread := without_effect(cfg, typed, axes_of(HydraConfig.get())):
                     raise ConfigError(unread)
                 OmegaConf.resolve(cfg)
-                _check_device(cfg, typed)
+                _check_device(cfg, config_name, typed)
                 construct(Paths, cfg.paths, "paths")
                 _check_top_level(cfg, config_name)
                 _check_name(cfg, config_name)
@@ -300,8 +301,14 @@ def _fail(error: Exception) -> None:
     sys.exit(USAGE_ERROR if RESULT in os.environ and isinstance(error, (ConfigError, NameRefused)) else 2)
 
 
-def _check_device(cfg: DictConfig, typed: Sequence[str]) -> None:
-    """Raise ``ConfigError`` before any work is done if there is no GPU for ``trainer=gpu``. The message names what was typed."""
+def _check_device(cfg: DictConfig, config_name: str, typed: Sequence[str]) -> None:
+    """Raise ``ConfigError`` before any work is done if there is no GPU for ``trainer=gpu``, or if a command in one process gets several.
+
+    The message names what was typed.
+    """
+    if config_name != "fit" and (count := num_processes(cfg)) > 1:
+        key = next((override for override in typed if override.lstrip("+").startswith("trainer")), "trainer")
+        raise ConfigError(f"{key}: sets {count} processes, and only gpe_pl.fit computes in several; leave it out")
     if OmegaConf.select(cfg, "trainer.accelerator") != "gpu":
         return
     import torch

@@ -63,7 +63,7 @@ def test_an_experiment_states_its_own_name(experiment: str) -> None:
         (["experiment=few_shot"], "snow_few_12", "snow_few"),
         (["experiment=few_shot", "data=elastomer"], "elastomer_few_12", "elastomer_few"),
         (["experiment=few_shot", "data=fem", "adaptation=scratch_five_times"], "fem_few_60", "fem_few"),
-        (["experiment=few_shot_poisson"], "elastomer_few_12", "elastomer_few"),
+        (["experiment=few_shot_poisson"], "elastomer_poisson_few_12", "elastomer_poisson_few"),
         (["experiment=scales", "scaling=general"], "sand_scales", "sand_scales"),
         (["experiment=scales", "data=snow", "scaling=specialist", "evaluation.data.spacing_factor=2.0"], *["snow_scales_spacing_2"] * 2),
     ],
@@ -71,6 +71,14 @@ def test_an_experiment_states_its_own_name(experiment: str) -> None:
 def test_sets_of_an_experiment_are_named_after_their_data(overrides: list[str], trained: str, evaluated: str) -> None:
     cfg = compose("fit", *overrides)
     assert (cfg.data.name, evaluated_config(cfg).data.name) == (trained, evaluated)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("settings", ["experiment=table1", "experiment=tuning", "experiment=few_shot"])
+def test_evaluated_scenes_are_not_those_of_the_run(settings: str, seed: int) -> None:
+    cfg = compose("fit", settings, f"data.seed={seed}")
+    assert evaluated_config(cfg).data.seed != cfg.data.seed
 
 
 @pytest.mark.slow

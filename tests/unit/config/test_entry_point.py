@@ -493,6 +493,14 @@ def test_a_suite_that_computes_on_the_cpu_refuses_a_gpu(
     assert capsys.readouterr().err.startswith("error: trainer.accelerator=gpu: suite=stability computes on the CPU; leave trainer=gpu out")
 
 
+def test_a_command_in_one_process_refuses_several(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    with pytest.raises(SystemExit):
+        call(monkeypatch, tmp_path, benchmark, "suite=stability", "trainer.devices=2")
+    assert capsys.readouterr().err.startswith("error: trainer.devices=2: sets 2 processes, and only gpe_pl.fit computes in several; leave it out")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", sorted(path.stem for path in (CONF / "suite").glob("*.yaml")))
 def test_the_size_of_a_benchmark_is_that_of_its_data_sets(suite: str) -> None:
