@@ -53,16 +53,30 @@ class _Rest:
         count: number of predictions in a row for which each node has been at rest [node].
         gravity: gravity [dim] in m/s²; None if it is not known.
         boundary: boundary without a prescribed motion; None if it moves or is not known.
+        nodes: positions [node, dim], masses [node, 1] and material parameters [node, param], side by side; None if they are not known.
     """
 
     count: Tensor
     gravity: Tensor | None = None
     boundary: Boundary | None = None
+    nodes: Tensor | None = None
 
     def of_rows(self, rows: np.ndarray) -> _Rest:
         """Return the counts of other nodes, as ``rollout.flow.FollowsNodes``; nodes that are new or move with an opening have not been at rest."""
         row = torch.from_numpy(rows).to(self.count.device)
-        return replace(self, count=torch.where(row >= 0, self.count[row.clamp(min=0)], 0))
+        kept = row.clamp(min=0)
+        return replace(self, count=torch.where(row >= 0, self.count[kept], 0), nodes=None if self.nodes is None else self.nodes[kept])
+
+    def counts_in(self, state: State, distance: float) -> Tensor:
+        """Return the counts [node] in a state; zeros for nodes that somebody changed or moved by more than this distance [m] between steps."""
+        if not self.holds_in(state):
+            return torch.zeros_like(self.count)
+        if self.nodes is None:
+            return self.count
+        now, dim = _described(state), state.dim
+        moved = (now[:, :dim] - self.nodes[:, :dim]).norm(dim=1) > distance
+        is_same = (now[:, dim:] == self.nodes[:, dim:]) | (now[:, dim:].isnan() & self.nodes[:, dim:].isnan())
+        return torch.where(moved | ~is_same.all(dim=1), 0, self.count)
 
     def holds_in(self, state: State) -> bool:
         """Return whether gravity and boundary are still those in which nodes came to rest."""
@@ -74,8 +88,8 @@ class Sleeping(Batched):
     """Simulator in which islands at rest sleep: their nodes keep their positions and are not computed.
 
     An island wakes up when a node that is awake, or a wall that moves with a prescribed motion, comes within the radius of the graph, and when a force acts on
-    one of its nodes, a given motion moves one, or one gets a velocity. All islands wake up when gravity or a boundary without a prescribed motion is changed
-    between steps.
+    one of its nodes, a given motion moves one, or one gets a velocity. It wakes up when the mass or a parameter of one of its nodes is changed between steps, or
+    its position by more than a node at rest moves. All islands wake up when gravity or a boundary without a prescribed motion is changed between steps.
 
     An island (see ``graphs.islands``) falls asleep if all its nodes have been at rest in the last ``Skips.sleep_after`` predictions.
     ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` limit velocities at rest: those at the frame if the model predicts them, otherwise
@@ -116,7 +130,7 @@ class Sleeping(Batched):
         """Return masks [node] of the awake nodes and of all nodes that the graph for their prediction contains."""
         after = self.simulator.skips.sleep_after
         assert after is not None
-        is_calm = ((_rest_of(state) >= after) & self._are_slow(_velocity(state))).cpu().numpy()
+        is_calm = ((self._rest_of(state) >= after) & self._are_slow(_velocity(state))).cpu().numpy()
         if not is_calm.any():
             everything = torch.ones(state.num_nodes, dtype=torch.bool, device=state.pos.device)
             return everything, everything
@@ -163,7 +177,7 @@ class Sleeping(Batched):
             before, now = _velocity(state), at_frame
         least_change = self.simulator.skips.rest_step_change_spacings * self.simulator.builder.metadata.spacing / self.dt
         calm = self._are_slow(now) & ((now - before).norm(dim=1) < least_change)
-        known = _rest_of(state)
+        known = self._rest_of(state)
         count = torch.where(awake, torch.where(calm, known + 1, 0), known)
         new = state.later(
             self.dt,
@@ -174,7 +188,20 @@ class Sleeping(Batched):
             num_asleep=int((~awake).sum()),
             lost_impulse=float((state.mass * before.norm(dim=1))[~awake].sum()),
         )
-        return replace(new, internal=_Rest(count, state.gravity.clone(), new.boundary if new.boundary.motion is None else None))
+        boundary = new.boundary if new.boundary.motion is None else None
+        return replace(new, internal=_Rest(count, state.gravity.clone(), boundary, _described(new)))
+
+    def _rest_of(self, state: State) -> Tensor:
+        """Return the number of predictions in a row for which each node has been at rest [node]; zeros if its surroundings have changed."""
+        if not isinstance(state.internal, _Rest):
+            return torch.zeros(state.num_nodes, dtype=torch.int64, device=state.pos.device)
+        skips = self.simulator.skips  # nodes at rest move in repeated frames, too
+        return state.internal.counts_in(state, skips.repeat_frames * skips.rest_step_spacings * self.simulator.builder.metadata.spacing)
+
+
+def _described(state: State) -> Tensor:
+    """Return positions, masses and parameters of the nodes [node, dim + 1 + param]. Only edits of a state change them between steps."""
+    return torch.cat([state.pos, state.mass[:, None], state.material_params], dim=1)
 
 
 def _are_loaded(loads: Loads) -> np.ndarray:
@@ -196,13 +223,6 @@ def _are_equal(one: Boundary, other: Boundary) -> bool:
 def _velocity(state: State) -> Tensor:
     """Return the velocities that tell whether nodes are at rest [node, dim] in m/s: those at the frame if they are known, else mean ones."""
     return state.vel if state.frame_velocity is None else state.frame_velocity
-
-
-def _rest_of(state: State) -> Tensor:
-    """Return the number of predictions in a row for which each node has been at rest [node]; zeros if the surroundings have changed."""
-    if isinstance(state.internal, _Rest) and state.internal.holds_in(state):
-        return state.internal.count
-    return torch.zeros(state.num_nodes, dtype=torch.int64, device=state.pos.device)
 
 
 def _in_the_same_island(chosen: np.ndarray, label: np.ndarray) -> np.ndarray:

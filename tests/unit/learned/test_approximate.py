@@ -170,6 +170,20 @@ def test_a_node_that_is_given_a_velocity_wakes_its_island() -> None:
     torch.testing.assert_close(after.vel, sleeping.simulator.step(kicked).vel)
 
 
+@pytest.mark.parametrize("name", ["pos", "mass", "material_params"])
+def test_a_node_that_is_edited_wakes_its_island(name: str) -> None:
+    sleeping, state = asleep_on_the_floor()
+    edited = getattr(state, name).clone()
+    edited[3] += 0.01
+    changed = replace(state, **{name: edited})
+    after = sleeping.step(changed)
+    assert after.num_asleep == 20
+    torch.testing.assert_close(after.vel, sleeping.simulator.step(changed).vel)
+    assert sleeping.step(replace(state, **{name: getattr(state, name).clone()})).num_asleep == 40
+    getattr(state, name)[3] += 0.01  # in place
+    assert sleeping.step(state).num_asleep == 20
+
+
 def test_momentum_is_lost_once_and_counted() -> None:
     simulated = silenced(simulator(scenes.builder(), rest_step_spacings=0.01))
     state = two_heaps(gap=1.0).to_torch()
