@@ -88,8 +88,8 @@ class Sleeping(Batched):
     """Simulator in which islands at rest sleep: their nodes keep their positions and are not computed.
 
     An island wakes up when a node that is awake, or a wall that moves with a prescribed motion, comes within the radius of the graph, and when a force acts on
-    one of its nodes, a given motion moves one, or one gets a velocity. It wakes up when the mass or a parameter of one of its nodes is changed between steps, or
-    its position by more than a node at rest moves. All islands wake up when gravity or a boundary without a prescribed motion is changed between steps.
+    one of its nodes, a given motion moves one, or one gets a velocity. It wakes up when one of its nodes gets another mass or parameter between steps, or is
+    moved further than nodes at rest move. All islands wake up when gravity or a boundary without a prescribed motion is changed between steps.
 
     An island (see ``graphs.islands``) falls asleep if all its nodes have been at rest in the last ``Skips.sleep_after`` predictions.
     ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` limit velocities at rest: those at the frame if the model predicts them, otherwise

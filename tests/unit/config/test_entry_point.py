@@ -498,7 +498,9 @@ def test_a_command_in_one_process_refuses_several(
 ) -> None:
     with pytest.raises(SystemExit):
         call(monkeypatch, tmp_path, benchmark, "suite=stability", "trainer.devices=2")
-    assert capsys.readouterr().err.startswith("error: trainer.devices=2: sets 2 processes, and only gpe_pl.fit computes in several; leave it out")
+    assert capsys.readouterr().err.startswith(
+        "error: trainer.devices=2: sets 2 processes, and only gpe_pl.fit computes in several; leave it out"
+    )
 
 
 @pytest.mark.slow
