@@ -16,6 +16,7 @@ from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
 from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError
 from gpe_pl.metrics import bootstrap_interval, bootstrap_ratio, median_of_means
+from gpe_pl.reports.body_table import body_lines
 from gpe_pl.reports.finished_runs import Run, Values, axes_of, rollout_errors, shared_table, shared_trajectories, starts_of, values_by_seed
 from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, write_material_figure
 from gpe_pl.reports.stride_table import DIFFERENT_STARTS
@@ -38,6 +39,7 @@ def report_evaluations(folder: Path, runs: Sequence[Run]) -> None:
     lines = _error_lines(groups)
     if materials := material_lines(controlled):
         lines += ["", *materials]
+    lines += body_lines([(domain, label, [run]) for (domain, _), own in groups.items() for label, run in own.items()])
     replace_text(folder / EVALUATIONS_MD, "\n".join([*lines, ""]))
     write_material_figure(folder / MATERIALS_FIGURE, controlled)
 

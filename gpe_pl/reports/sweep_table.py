@@ -20,7 +20,7 @@ from gpe_pl.evaluation.metric_rows import EXACT, LEARNED, read_rows
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.files.markdown import table_row
-from gpe_pl.metrics import bootstrap_interval
+from gpe_pl.reports.body_table import body_lines
 from gpe_pl.reports.finished_runs import (
     UNSEEN_GROUPS,
     Run,
@@ -41,6 +41,7 @@ from gpe_pl.reports.finished_runs import (
     with_groups,
 )
 from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, verdict, write_material_figure
+from gpe_pl.reports.mean_text import mean_text
 from gpe_pl.reports.outcome import outcomes
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
 from gpe_pl.reports.ratio_table import ratio_lines
@@ -208,18 +209,6 @@ def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
         writer.writerows(lines)
 
 
-def _interval(values: Values, scale: float = 1.0) -> str:
-    """Format a mean with its bootstrap interval. If rollouts failed, the mean is infinite; then the number of failures and the median are shown."""
-    if not values:
-        return "–"
-    table = shared_table(values) * scale
-    failed = int(np.sum(~np.isfinite(table)))
-    if failed:
-        return f"{failed} of {table.size} failed, median {np.median(table):.3g}"
-    i = bootstrap_interval(table, statistic=np.mean)
-    return f"{i.estimate:.3g} [{i.low:.3g}, {i.high:.3g}]"
-
-
 def forward_time_ratios(folder: Path, variants: dict[Variant, list[Run]]) -> dict[Variant, float]:
     """Return the forward time of each variant divided by that of the first, as measured by ``benchmarks.forward_times``; empty if it was not measured."""
     path = folder / FORWARD_TIMES
@@ -254,6 +243,7 @@ def _markdown(axes: list[str], variants: dict[Variant, list[Run]], ratios: dict[
             *ratio_lines(axes, variants, _horizons(run for runs in variants.values() for run in runs)),
             *_stress_table(names, variants),
             *_metric_table(names, variants, BODY_COLUMNS, BODY_NOTE),
+            *body_lines([(*key, runs) for key, runs in _material_groups(variants).items()]),
             *_metric_table(names, variants, LIQUID_COLUMNS, LIQUID_NOTE),
             *(["", *strides] if (strides := stride_lines(axes, variants)) else []),
             *(["", *lines] if (lines := material_lines(_material_groups(variants))) else []),
@@ -283,7 +273,7 @@ def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios
                     str(len(runs)),
                     f"{np.mean(losses):.4f} ({min(losses):.4f} – {max(losses):.4f})" if losses else "–",
                     f"{ratios[key]:.2f}" if key in ratios else "–",
-                    _interval(values_by_seed(runs, LEARNED, "test", "momentum_error", "full")),
+                    mean_text(values_by_seed(runs, LEARNED, "test", "momentum_error", "full")),
                     _percent(values_by_seed(runs, LEARNED, "test", "fraction_outside_uncontained", "full")),
                     _percent(values_by_seed(runs, LEARNED, "test", "fraction_corrected", "full"))
                     + _failed(values_by_seed(runs, LEARNED, "test", "rollout_mse", "full")),
@@ -313,12 +303,12 @@ def _rollout_table(names: list[str], variants: dict[Variant, list[Run]]) -> list
                 values = rollout_errors(runs, split, h)
                 trivial = [v for b in baselines if (v := values_by_seed(runs[:1], b, split, "rollout_mse", h))]
                 failed = _failed(values_by_seed(runs, LEARNED, split, "rollout_mse", h))
-                cells.append(_interval(values, 1e3) + _factor(_times_lower(values, trivial)) + failed if values else "–")
+                cells.append(mean_text(values, 1e3) + _factor(_times_lower(values, trivial)) + failed if values else "–")
             lines.append(table_row([*(key or (LEARNED,)), split, *cells]))
         for baseline in baselines:
             rows: defaultdict[tuple[str, ...], list[Variant]] = defaultdict(list)  # most sweeps evaluate all variants in the same scenes
             for key, runs in variants.items():
-                rows[tuple(_interval(values_by_seed(runs[:1], baseline, split, "rollout_mse", h), 1e3) for h in horizons)].append(key)
+                rows[tuple(mean_text(values_by_seed(runs[:1], baseline, split, "rollout_mse", h), 1e3) for h in horizons)].append(key)
             rows.pop(("–",) * len(horizons), None)
             for shown, keys in rows.items():
                 of = f"{baseline} ({' / '.join(', '.join(key) for key in keys)})" if len(rows) > 1 else baseline
@@ -392,7 +382,7 @@ def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[
     for key, runs in stressed.items():
         for split in sorted({split for run in runs for split in run.rows["split"]}):
             for metric in ("displacement_error", "velocity_error", *STRESS_METRICS):
-                cells = [_interval(values_by_seed(runs, LEARNED, split, metric, h)) for h in horizons]
+                cells = [mean_text(values_by_seed(runs, LEARNED, split, metric, h)) for h in horizons]
                 lines.append(table_row([*(key or (LEARNED,)), split, metric.removesuffix("_error").replace("_", " "), *cells]))
     note = (
         "L2 errors relative to the ground truth's displacement and velocity up to the horizon, and to its stress over all frames; von Mises stress, and stress "
@@ -411,7 +401,7 @@ def _metric_table(names: list[str], variants: dict[Variant, list[Run]], headings
     lines = ["", table_row(header), "|" + "---|" * len(header)]
     for key, runs in variants.items():
         for split in splits_of(runs[0]):
-            cells = [_interval(values_by_seed(runs, LEARNED, split, metric, "full")) for metric in columns]
+            cells = [mean_text(values_by_seed(runs, LEARNED, split, metric, "full")) for metric in columns]
             lines.append(table_row([*(key or (LEARNED,)), split, *cells]))
     return [*lines, "", note]
 
