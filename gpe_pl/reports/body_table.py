@@ -81,7 +81,8 @@ def _peak_lines(groups: Labelled) -> list[str]:
     header = ["domain", "model", "seeds", "rises, model", "rises, solver"]
     note = (
         "In how many scenes with unseen parameters does the peak of the von Mises stress rise with the parameter? Model: all seeds together, from the lower to "
-        "the higher of a scene's own and the farthest trained value. Solver: from the lowest to the highest trained value. Equal peaks, such as those of a model without the parameter, do not rise."
+        "the higher of a scene's own and the farthest trained value. Solver: from the lowest to the highest trained value. Equal peaks, such as those of a "
+        "model without the parameter, do not rise."
     )
     return ["", table_row(header), "|" + "---|" * len(header), *rows, "", note]
 
