@@ -31,6 +31,7 @@ from gpe_pl.reports.sweep_table import summary
 
 SUITES: tuple[Suite, ...] = ("acceptance", "stability")
 BASELINE_NAMES = {"ballistic": "ballistic flight", "stops_at_walls": "nodes that stop at walls", "constant_velocity": "constant velocity"}
+TRIED = "The guide's pages on stress tests, acceptance and stability say what failures mean, and what was tried."
 REFUSED = "Other frame intervals and spacings are refused."
 
 
@@ -122,8 +123,9 @@ def _bodies(rows: list[Row]) -> str:
 
 
 def _opening(name: str, headline: str) -> list[str]:
-    """The first lines of a card."""
-    return [f"# {name}", "", f"**{headline[0].upper()}{headline[1:].replace('|', '/').replace('*', '')}.**", ""]
+    """The first lines of a card: what fails, and where the guide says what was tried against it."""
+    said = f"**{headline[0].upper()}{headline[1:].replace('|', '/').replace('*', '')}.**"
+    return [f"# {name}", "", said if headline == verdicts.NOT_MEASURED else f"{said} {TRIED}", ""]
 
 
 def shipped(run: Path, name: str, commit: str, command: str, *evaluations: str) -> None:
