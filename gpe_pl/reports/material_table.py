@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 
 import numpy as np
 
@@ -32,6 +33,20 @@ WITHOUT = "none"
 EMBEDDING = "model.material_embedding"
 MAY_DIFFER = {EMBEDDING, "seed", "training.num_steps", "checkpoint"}
 """Settings in which a model without the parameter may differ from the model that it is compared with."""
+
+CURVES = {
+    "own": "own value",
+    "nearest": "nearest trained value",
+    "middle": "middle trained value",
+    "far": "farthest trained value",
+    "shuffled": "value of another scene",
+    WITHOUT: "trained without the parameter",
+    SOLVER_NEAREST: "solver, nearest trained value",
+    SOLVER_ENDS: "solver, lowest against highest",
+}
+"""Names of the curves in ``MATERIALS_FIGURE``."""
+LONGEST_LINE = 45
+"""Largest number of characters in a line of a panel's title."""
 
 FARTHER = ("middle", "shuffled")
 """Controls that differ from a scene's own parameters by more than the nearest trained ones."""
@@ -132,28 +147,39 @@ def _horizons(groups: Groups) -> list[str]:
 
 
 def write_material_figure(path: Path, groups: Groups) -> None:
-    """Draw the errors of each group with controls against the parameter, with the controls; nothing is written if there is no group."""
+    """Draw the errors of each group with controls against the parameter, with the controls; nothing is written if there is no group.
+
+    A group without the parameter has no panel of its own if it is a curve in the panel of another group.
+    """
     from gpe_pl.viz.comparison import parameter_figure
 
+    shown = {key: runs for key, runs in groups.items() if reads_material(runs) is not None}
+    twins = {key: _apart(_without(groups, key[0], runs), runs) for key, runs in shown.items()}
+    drawn = [run for found in twins.values() for run in found]
+    shown = {key: runs for key, runs in shown.items() if len(_apart(runs, drawn)) == len(runs)}
+    names = [domain for domain, _ in shown]
     curves: dict[str, dict[str, dict[float, list[float]]]] = {}
     seen: dict[str, list[float]] = {}
     axes: dict[str, str] = {}
-    for (domain, label), runs in groups.items():
-        if reads_material(runs) is None:
-            continue
-        title = f"{domain}, {label}"
-        curves[title] = {"own value": _points(runs, LEARNED)}
-        curves[title] |= {f"{control} value": _points(runs, label_of(LEARNED, control)) for control in CONTROLS}
-        curves[title]["without the parameter"] = _points(_without(groups, domain, runs), LEARNED)
-        curves[title] |= {name: _points(runs, name) for name in (SOLVER_NEAREST, SOLVER_ENDS)}
+    for (domain, label), runs in shown.items():
+        title = domain if names.count(domain) == 1 else "\n".join(wrap(f"{domain}, {label}", LONGEST_LINE))
+        curves[title] = {CURVES["own"]: _points(runs, LEARNED)}
+        curves[title] |= {CURVES[control]: _points(runs, label_of(LEARNED, control)) for control in CONTROLS}
+        curves[title][CURVES[WITHOUT]] = _points(twins[domain, label], LEARNED)
+        curves[title] |= {CURVES[name]: _points(runs, name) for name in (SOLVER_NEAREST, SOLVER_ENDS)}
         curves[title] = {name: points for name, points in curves[title].items() if points}
         rows = runs[0].rows
         trained = [value for key, value in runs[0].config.items() if key.startswith("data.parameters.") and key.endswith(".seen")]
         seen[title] = _numbers(trained[0]) if len(trained) == 1 else rows[rows["parameter_group"] == "seen"]["parameter"].unique().tolist()
         axes[title] = axis_label(runs[0])
     if curves:
-        figure = parameter_figure(curves, seen, "rollout MSE [m²]", axes, references=(SOLVER_NEAREST, SOLVER_ENDS))
+        figure = parameter_figure(curves, seen, "rollout MSE [m²]", axes, references=(CURVES[SOLVER_NEAREST], CURVES[SOLVER_ENDS]))
         save_figure(figure, path, dpi=150)
+
+
+def _apart(runs: Sequence[Run], others: Sequence[Run]) -> list[Run]:
+    """Return the runs that are not among the others."""
+    return [run for run in runs if not any(run is other for other in others)]
 
 
 def _answer(is_better: bool, ratio: Interval, count: int) -> str:

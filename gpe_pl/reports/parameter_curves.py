@@ -9,6 +9,7 @@ import numpy as np
 from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.reports.finished_runs import Run, rollout_errors
 from gpe_pl.schema import MATERIALS
+from gpe_pl.viz.captions import UNITS, parameter_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,5 +45,6 @@ def parameter_curves(by_domain: dict[str, dict[str, list[Run]]]) -> Figure:
 
 def axis_label(run: Run) -> str:
     """Return the label of an axis with the material parameters of a run's data set."""
-    varied = [m for m in MATERIALS if any(key.startswith(f"data.parameters.{m}.") for key in run.config)]
-    return ", ".join(f"{MATERIALS[m][0].name.replace('_', ' ')}\n[{MATERIALS[m][0].unit}]" for m in varied)
+    varied = [MATERIALS[m][0] for m in MATERIALS if any(key.startswith(f"data.parameters.{m}.") for key in run.config)]
+    units = [UNITS.get(p.unit, p.unit).strip() for p in varied]
+    return ", ".join(f"{parameter_name(p)} [{unit}]" if unit else parameter_name(p) for p, unit in zip(varied, units, strict=True))

@@ -7,12 +7,17 @@ from types import MappingProxyType
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
 from gpe_pl.metrics import Interval
 from gpe_pl.viz.captions import as_written
 from gpe_pl.viz.coloring import PALETTE, curve_styles
 from gpe_pl.viz.film_strip import TEXT_WIDTH, new_figure
+
+MOST_COLUMNS = 3
+"""Largest number of panels in a row of ``parameter_figure``."""
+LONG_TITLE = 30
+"""Number of characters from which a title of a panel has small letters."""
 
 
 def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], references: Mapping[str, Mapping[str, float]], label: str) -> Figure:
@@ -66,7 +71,10 @@ def parameter_figure(
     parameters: Mapping[str, str] = MappingProxyType({}),
     references: Sequence[str] = (),
 ) -> Figure:
-    """Draw median error over trajectories and seeds against the material parameter, a panel per domain; ticks at the bottom mark trained values.
+    """Draw median error over trajectories and seeds against the material parameter, a panel per domain.
+
+    Shading marks the trained range, and triangles at the bottom mark trained values. If there are references, the first model has a broad line below the
+    others, so that curves that coincide with it are visible.
 
     Args:
         curves: errors by domain, model and parameter value. Scenes without one value have NaN (``Row.parameter``) and are left out.
@@ -78,9 +86,14 @@ def parameter_figure(
     Raises:
         ValueError: there are more models than can be told apart, or no scene of a domain has one value.
     """
-    figure = new_figure(TEXT_WIDTH, 2.4)
+    columns = 2 if len(curves) == 4 else min(len(curves), MOST_COLUMNS)
+    rows = -(-len(curves) // columns)
+    figure = new_figure(TEXT_WIDTH, 2.4 if rows == 1 else 1.9 * rows + 0.6)
     figure.set_layout_engine("constrained")
-    panels = figure.subplots(1, len(curves), squeeze=False)[0]
+    grid = figure.subplots(rows, columns, squeeze=False)
+    panels = grid.flat[: len(curves)]
+    for axes in grid.flat[len(curves) :]:
+        axes.remove()
     models = list(dict.fromkeys(m for domain in curves.values() for m in domain))
     styles = curve_styles(len(models))
     for axes, (domain, by_model) in zip(panels, curves.items(), strict=True):
@@ -96,32 +109,34 @@ def parameter_figure(
             points = [p for p in points if np.isfinite(p[1])]
             color, dash = styles[k]
             style, color = (("s--", "d:")[references.index(model) % 2], "0.45") if model in references else (f"o{dash}", color)
+            is_broad = k == 0 and bool(references)
             axes.plot(
                 [p for p, _ in points],
                 [v for _, v in points],
                 style,
-                markersize=2.5,
-                linewidth=0.8,
-                zorder=3 - 0.1 * k,  # the first model is not hidden
+                markersize=4.5 if is_broad else 2.5,
+                linewidth=2.4 if is_broad else 0.8,
+                zorder=2 if is_broad else 3 - 0.1 * k,  # without references, the first model is not hidden
                 color=color,
                 label=as_written(model),
             )
-        axes.plot(
-            list(seen.get(domain, [])),
-            [0.0] * len(seen.get(domain, [])),
-            "|",
-            color="0.4",
-            transform=axes.get_xaxis_transform(),
-            markersize=6,
-        )
-        axes.set_title(domain, fontsize=8)
-        axes.set_xlabel(parameters.get(domain, ""), fontsize=6)
+        if trained := list(seen.get(domain, [])):
+            axes.axvspan(min(trained), max(trained), color="0.93", zorder=0, label="trained range")
+            bottom, foot = [0.025] * len(trained), axes.get_xaxis_transform()
+            axes.plot(trained, bottom, "^", color="0.35", transform=foot, markersize=2.5, label="trained values", zorder=1)
+        axes.set_title(as_written(domain), fontsize=8 if len(domain) < LONG_TITLE else 6)
+        axes.set_xlabel(parameters.get(domain, ""), fontsize=7)
+        low, high = np.log10(axes.get_ylim())
+        if np.floor(high) - np.ceil(low) < 1:  # at most one power of ten, from which no scale can be read
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_major_formatter(LogFormatterSciNotation(labelOnlyBase=False, minor_thresholds=(np.inf, np.inf)))
         axes.tick_params(which="major", labelsize=6)
         axes.tick_params(which="minor", labelleft=False, labelbottom=False)
         axes.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylabel(label, fontsize=8)
-    lines, names = panels[0].get_legend_handles_labels()
-    figure.legend(lines, names, loc="outside lower center", ncols=min(len(models), 5), fontsize=6, frameon=False)
+    for axes in grid[:, 0]:
+        axes.set_ylabel(label, fontsize=8)
+    entries = {name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=min(len(entries), 4), fontsize=7, frameon=False)
     return figure
 
 

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, label_of
 from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
@@ -15,7 +17,9 @@ from gpe_pl.files import sealed
 from gpe_pl.reports import sweep_table
 from gpe_pl.reports.domain_table import report_domains
 from gpe_pl.reports.finished_runs import Run, finished_runs
-from gpe_pl.reports.material_table import _errors, _means, _without, material_lines, reads_material, verdict
+from gpe_pl.reports.material_table import _errors, _means, _without, material_lines, reads_material, verdict, write_material_figure
+from gpe_pl.reports.parameter_curves import axis_label
+from gpe_pl.viz import comparison
 
 HARD = np.array([1.0, 2.0, 4.0, 8.0, 3.0, 5.0])
 """Errors of six scenes [1e-3 m²]; those with odd numbers are extrapolated in pairs, so their errors are not used."""
@@ -116,6 +120,44 @@ def test_tables_of_domains_have_the_controls_of_every_model(tmp_path: Path) -> N
     table = (tmp_path / "table1.csv").read_text()
     assert "sand,GNS at nearest value,0,test_unseen,rollout_mse" in table and "sand,solver at nearest value,,test_unseen" in table
     assert (tmp_path / "reads_material.png").exists()
+
+
+def test_a_model_without_the_parameter_is_a_curve_beside_the_model(sweep: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_run(sweep / "alone", "none", 0, READS, data="snow")
+    drawn: dict[str, Any] = {}
+    monkeypatch.setattr(comparison, "parameter_figure", lambda curves, *_, **__: drawn.update(curves) or Figure())
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in finished_runs(sweep):
+        groups.setdefault((str(run.config["data.name"]), str(run.config["model.material_embedding"])), []).append(run)
+    write_material_figure(sweep / "reads_material.png", groups)
+    assert {*drawn} == {"sand", "snow"}
+    errors = {name: np.median([points[20.5 + k] for k in range(6)]) for name, points in drawn["sand"].items()}
+    middle = float(np.median([1e-3 * error * (1 + 0.3 * seed) for error in HARD for seed in (0, 1)]))
+    assert errors["trained without the parameter"] == pytest.approx(1.2 * middle)
+    assert errors["own value"] == pytest.approx(0.9 * middle) and errors["nearest trained value"] == pytest.approx(middle)
+    assert len(drawn["sand"]) == 8 and len(drawn["snow"]) == 7
+
+
+def test_two_models_of_a_domain_have_their_names_above_their_panels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_run(tmp_path / "run", "affine", 0, READS)
+    drawn: dict[str, Any] = {}
+    monkeypatch.setattr(comparison, "parameter_figure", lambda curves, *_, **__: drawn.update(curves) or Figure())
+    runs = finished_runs(tmp_path)
+    write_material_figure(tmp_path / "reads_material.png", {("sand", "A"): runs, ("sand", "B"): [replace(runs[0])]})
+    assert [*drawn] == ["sand, A", "sand, B"]
+
+
+@pytest.mark.parametrize(
+    ("material", "label"),
+    [
+        ("sand", "friction angle [°]"),
+        ("fluid", "kinematic viscosity [m²/s]"),
+        ("solid", "Young’s modulus [Pa]"),
+        ("snow", "hardening coefficient"),
+    ],
+)
+def test_axes_name_the_parameter_and_its_unit(material: str, label: str) -> None:
+    assert axis_label(Run(Path(), {f"data.parameters.{material}.seen": "[1.0]"}, pd.DataFrame())) == label
 
 
 @pytest.mark.slow

@@ -48,6 +48,32 @@ def test_scenes_without_one_parameter_are_left_out_of_the_figure() -> None:
         parameter_figure({"mixed": {"GPE": {nan: [1.0]}, "GNS": {nan: [2.0]}}}, {}, "error")
 
 
+def test_each_domain_has_a_panel_with_its_trained_range() -> None:
+    curves = {f"d{k}": {"own": {1.0: [1.0], 3.0: [2.0]}, "nearest": {1.0: [1.0], 3.0: [2.0]}, "solver": {1.0: [0.1]}} for k in range(5)}
+    figure = parameter_figure(curves, {domain: [1.5, 2.0, 2.5] for domain in curves}, "error", references=["solver"])
+    assert [axes.get_title() for axes in figure.axes] == [*curves]
+    assert len({axes.get_position().y0 for axes in figure.axes}) == 2  # rows
+    for axes in figure.axes:
+        (shading,) = axes.patches
+        assert (shading.get_x(), shading.get_width()) == (1.5, 1.0)
+        own, nearest = (line for line in axes.lines if line.get_label() in ("own", "nearest"))
+        assert (
+            own.get_linewidth() > 2 * nearest.get_linewidth() and own.get_zorder() < nearest.get_zorder()
+        )  # coinciding curves are visible
+    (legend,) = figure.legends
+    assert {text.get_text() for text in legend.get_texts()} == {"own", "nearest", "solver", "trained range", "trained values"}
+
+
+@pytest.mark.parametrize("highest", [0.006, 60.0])
+def test_the_axis_of_errors_has_two_labels_or_more(highest: float) -> None:
+    figure = parameter_figure({"sand": {"GPE": {20.0: [0.002], 30.0: [highest]}}}, {}, "error")
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    low, high = axes.get_ylim()
+    shown = [label for label in axes.yaxis.get_majorticklabels() if low <= label.get_position()[1] <= high and label.get_text()]
+    assert len(shown) >= 2
+
+
 def test_coverage_below_the_usual_range_is_in_the_picture() -> None:
     bad = CoverageCurves(3, np.full((2, 4), 0.2), np.ones(4), np.ones(4))
     figure = coverage_figure({"seen": bad}, [0.5, 0.9], 0.9, 0.1, {2: "0.2 s", 3: "0.3 s"})
