@@ -8,6 +8,8 @@ RUN_FOLDER may also hold several evaluations by ``evaluate``, and their table by
 keeps what ``docs/results/NAME`` has of other models.
 ``python docs/embed_results.py --add RUN_FOLDER NAME [NOTE]`` does the same as without ``--add`` for a run that added models to a table which has others. The
 sessions of these are kept.
+``python docs/embed_results.py --draw NAME PICTURE`` draws a figure of reports, such as ``reads_material.png``, from the results of single rollouts that
+``docs/results/NAME`` keeps. The tables there stay as they are, because these results have errors over whole rollouts only.
 ``python docs/embed_results.py`` only renews the README and the list in ``docs/results/README.md``; ``--check`` fails if one differs from the files.
 """
 
@@ -20,6 +22,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from PIL import Image, ImageSequence
@@ -27,7 +30,8 @@ from PIL import Image, ImageSequence
 from gpe_pl.files import sealed
 from gpe_pl.files.markdown import table_row
 from gpe_pl.reports.finished_runs import archive, evaluations_below, finished_runs
-from gpe_pl.system.provenance import ADVICE, PROVENANCE, sessions
+from gpe_pl.reports.tables import write_tables
+from gpe_pl.system.provenance import ADVICE, PROVENANCE, recorded, sessions
 
 DOCS = Path(__file__).resolve().parent
 RESULTS = DOCS / "results"
@@ -41,6 +45,7 @@ FILES = (
 )
 PICTURES = (
     *("table1.png", "error_by_parameter.png", "validation_loss.png", "scaling.png", "showcase.png", "parameter_effect.png"),
+    "reads_material.png",
     *("rollout_test_00.png", "rollout_test_unseen_00.png", "stress_test_unseen_00.png", "error_curve_test.png"),
     *("long_horizon_*.png", "perturbation_*.png", "cost_error_*.png"),
     "engines.png",
@@ -111,6 +116,23 @@ def renew(run: Path, name: str, note: str = "") -> None:
             picture(path, target / path.name)
     before = sealed.read(target / PROVENANCE, ADVICE)
     sealed.write(target / PROVENANCE, {**before, "sessions": [*before["sessions"], *sessions(run)], "note": note or before["note"]})
+
+
+def draw(name: str, figure: str) -> None:
+    """Draw a figure of ``gpe_pl.reports`` into ``docs/results/{name}`` from the archive there, and add the session to those of the folder.
+
+    Raises:
+        FileNotFoundError: reports draw no such figure of these runs.
+    """
+    target = RESULTS / name
+    with TemporaryDirectory() as folder:
+        with recorded(Path(folder), "docs/embed_results.py", ["--draw", name, figure], folder):
+            write_tables(Path(folder), finished_runs(target))
+        picture(Path(folder, figure), target / figure)
+        session = sessions(Path(folder))
+    before = sealed.read(target / PROVENANCE, ADVICE)
+    earlier = [found for found in before["sessions"] if found["command"] != session[0]["command"]]
+    sealed.write(target / PROVENANCE, {**before, "sessions": [*earlier, *session]})
 
 
 def renewed(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -197,6 +219,8 @@ def main(arguments: list[str]) -> int:
         return int(any(path.read_text() != text for path, text in pages().items()))
     if arguments[:1] == ["--renew"]:
         renew(Path(arguments[1]), *arguments[2:])
+    elif arguments[:1] == ["--draw"]:
+        draw(*arguments[1:])
     elif arguments[:1] == ["--add"]:
         collect(Path(arguments[1]), *arguments[2:], adds=True)
     elif arguments:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import lzma
 import runpy
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -88,3 +89,25 @@ def test_records_of_other_models_are_kept() -> None:
     assert [own["value"] for own in renewed(old, [*new, {"model": "a", "scene": "z", "value": 13}])] == [10, 11, 12, 3, 13]
     with pytest.raises(ValueError, match="a x: not measured again"):
         renewed(old, new[1:])
+
+
+@pytest.mark.slow
+def test_a_figure_is_drawn_from_recorded_results(tmp_path: Path) -> None:
+    draw = runpy.run_path(str(ROOT / "docs" / "embed_results.py"))["draw"]
+    folder = tmp_path / "unseen_shipped"
+    shutil.copytree(RESULTS / folder.name, folder)
+    (folder / "reads_material.png").write_bytes(b"of an earlier run")
+    command = "python docs/embed_results.py --draw unseen_shipped reads_material.png"
+    old = sealed.read(folder / "provenance.json", "")
+    trained = [session for session in old["sessions"] if session["command"] != command]
+    sealed.write(folder / "provenance.json", {**old, "sessions": [*trained, {**trained[0], "command": command, "began": "earlier"}]})
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    draw.__globals__["RESULTS"] = tmp_path
+    draw(folder.name, "reads_material.png")
+    changed = {path.name for path in folder.iterdir() if before.get(path.name) != path.read_bytes()}
+    assert changed == {"reads_material.png", "provenance.json"}
+    with Image.open(folder / "reads_material.png") as image:
+        assert image.width > 500
+    about = sealed.read(folder / "provenance.json", "")
+    assert (about["note"], about["sessions"][:-1]) == (old["note"], trained)
+    assert about["sessions"][-1]["command"] == command and about["sessions"][-1]["began"] != "earlier"
