@@ -2,15 +2,18 @@
 
 ``python docs/training_losses.py KEY FOLDER NAME NOTE`` reads the logs of all trainings below FOLDER, groups them by the configuration key KEY, for example
 ``model.interaction``, and writes ``table.md``, ``losses.csv``, ``validation_loss.png`` and ``provenance.json`` to ``docs/results/NAME``.
+``python docs/training_losses.py --draw NAME`` draws the figure again from ``docs/results/NAME/losses.csv``.
 """
 
 from __future__ import annotations
 
 import csv
 import json
+import shutil
 import sys
 from collections import defaultdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from embed_results import RESULTS, picture
@@ -18,7 +21,7 @@ from embed_results import RESULTS, picture
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
-from gpe_pl.system.provenance import PROVENANCE, sessions
+from gpe_pl.system.provenance import ADVICE, PROVENANCE, recorded, sessions
 from gpe_pl.viz.figures import validation_loss_figure
 from gpe_pl.viz.saving import save_figure
 
@@ -72,14 +75,44 @@ def main(key: str, folder: Path, name: str, note: str) -> None:
         ends = spread([1e6 * values[rolled][shown[-1]] for values in seeds.values()])
         table.append(table_row([variant, str(len(seeds)), *losses, ends]))
     replace_text(target / "table.md", "\n".join([*table, "", "Medians over seeds, with their ranges.", ""]))
-    curves = {variant: [([*v[loss]], [*v[loss].values()]) for v in seeds.values()] for variant, seeds in groups.items()}
-    save_figure(validation_loss_figure(curves, "validation loss (one-step nMSE)"), target / "validation_loss.png", dpi=150)
-    picture(target / "validation_loss.png", target / "validation_loss.png")
+    figure(target)
     of_runs = [session for path in sorted(folder.rglob(PROVENANCE)) for session in sessions(path.parent)]
     sealed.write(
         target / PROVENANCE, {"sessions": of_runs[:1], "seeds": sorted({s for seeds in groups.values() for s in seeds}), "note": note}
     )
 
 
+def figure(target: Path) -> None:
+    """Draw ``validation_loss.png`` from ``losses.csv`` in the same folder."""
+    curves: dict[str, dict[str, tuple[list[int], list[float]]]] = defaultdict(dict)
+    with open(target / "losses.csv", newline="", encoding="utf-8") as handle:
+        _, *rows = csv.reader(handle)
+    for variant, seed, step, loss, _ in rows:
+        steps, losses = curves[variant].setdefault(seed, ([], []))
+        steps.append(int(step))
+        losses.append(float(loss))
+    of_seeds = {variant: list(seeds.values()) for variant, seeds in curves.items()}
+    path = target / "validation_loss.png"
+    save_figure(validation_loss_figure(of_seeds, "validation loss (one-step nMSE)"), path, dpi=150)
+    picture(path, path)
+
+
+def draw(name: str) -> None:
+    """Draw the figure of ``docs/results/{name}`` again, and add the session to those of the folder."""
+    target = RESULTS / name
+    with TemporaryDirectory() as folder:
+        with recorded(Path(folder), "docs/training_losses.py", ["--draw", name], folder):
+            shutil.copy(target / "losses.csv", folder)
+            figure(Path(folder))
+        shutil.copy(Path(folder, "validation_loss.png"), target)
+        (session,) = sessions(Path(folder))
+    before = sealed.read(target / PROVENANCE, ADVICE)
+    earlier = [found for found in before["sessions"] if found["command"] != session["command"]]
+    sealed.write(target / PROVENANCE, {**before, "sessions": [*earlier, session]})
+
+
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]), sys.argv[3], sys.argv[4])
+    if sys.argv[1] == "--draw":
+        draw(sys.argv[2])
+    else:
+        main(sys.argv[1], Path(sys.argv[2]), sys.argv[3], sys.argv[4])

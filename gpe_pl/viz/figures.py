@@ -146,7 +146,7 @@ def validation_loss_figure(curves: Mapping[str, Sequence[tuple[Numbers, Numbers]
         _draw_losses(axes, runs, _set_log_limits(axes, inside))
         axes.set_xlabel("training step", fontsize=8)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.set_title(title, fontsize=8)
+        axes.set_title(f"{title} (steps {begin * end:,.0f} to {stop * end:,.0f})" if title else "", fontsize=8)
         axes.set_xlim(begin * end, stop * end or None)
     figure.axes[0].set_ylabel(label, fontsize=8)
     figure.axes[0].legend(fontsize=7, frameon=False, handlelength=1.4)
@@ -195,7 +195,8 @@ def _set_log_limits(axes: Axes, values: np.ndarray) -> float:
     """Fit a logarithmic axis to the positive finite values; return the value above the top at which to draw infinity."""
     positive = values[np.isfinite(values) & (values > 0)]
     low, high = (positive.min(), positive.max()) if positive.size else (1e-1, 1.0)
-    axes.set_ylim(low / 1.5, high * 1.5)
+    margin = np.clip((high / low) ** 0.1, 1.05, 1.5)  # small for a small range, in which curves are close to each other
+    axes.set_ylim(low / margin, high * margin)
     return float(high * 10)
 
 

@@ -111,3 +111,19 @@ def test_a_figure_is_drawn_from_recorded_results(tmp_path: Path) -> None:
     about = sealed.read(folder / "provenance.json", "")
     assert (about["note"], about["sessions"][:-1]) == (old["note"], trained)
     assert about["sessions"][-1]["command"] == command and about["sessions"][-1]["began"] != "earlier"
+
+
+def test_losses_are_drawn_from_recorded_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    draw = runpy.run_path(str(ROOT / "docs" / "training_losses.py"))["draw"]
+    folder = tmp_path / "ablation_momentum_fluid_losses"
+    shutil.copytree(RESULTS / folder.name, folder)
+    (folder / "validation_loss.png").unlink(missing_ok=True)
+    old = sealed.read(folder / "provenance.json", "")
+    draw.__globals__["RESULTS"] = tmp_path
+    draw(folder.name)
+    with Image.open(folder / "validation_loss.png") as image:
+        assert image.width > 2 * image.height  # two windows
+    about = sealed.read(folder / "provenance.json", "")
+    assert (about["note"], about["sessions"][0]) == (old["note"], old["sessions"][0])
+    assert [session["command"] for session in about["sessions"][1:]] == [f"python docs/training_losses.py --draw {folder.name}"]

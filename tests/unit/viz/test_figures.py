@@ -160,9 +160,17 @@ def test_validation_losses_with_many_values_show_the_start_and_the_end_of_traini
     first, last = validation_loss_figure({"odd": [(steps, 100.0 / steps)], "directed": [(steps, 200.0 / steps)]}).axes
     assert first.get_xlim() == pytest.approx((0, 400))
     assert last.get_xlim() == pytest.approx((800, 2800))
+    assert [axes.get_title() for axes in (first, last)] == ["first seventh (steps 0 to 400)", "last five sevenths (steps 800 to 2,800)"]
     assert first.get_ylim()[1] > 2.0  # the largest loss of the first seventh
     assert last.get_ylim()[0] < 100 / 2800
     assert last.get_ylim()[1] < 1.0  # the range of its own window, in which curves of the end can be told apart
+
+
+def test_curves_that_are_close_fill_their_panel():
+    steps = np.arange(1, 4) * 100
+    (axes,) = validation_loss_figure({"odd": [(steps, [1.0, 1.2, 1.4])], "directed": [(steps, [2.0, 1.9, 1.8])]}).axes
+    low, high = axes.get_ylim()
+    assert 0.9 < low < 1.0 and 2.0 < high < 2.2
 
 
 def test_no_two_curves_look_alike():
