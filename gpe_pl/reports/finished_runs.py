@@ -228,6 +228,11 @@ def _flatten(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
         yield path, value if not isinstance(value, list) else json.dumps(value)
 
 
+NUM_STEPS, VAL_INTERVAL = "training.num_steps", "training.val_interval"
+"""Keys of the number of steps and of the validation interval. They count as compared settings only if runs with the same other settings and seed differ in
+them. Otherwise they follow from a time budget."""
+
+
 def axes_of(runs: list[Run]) -> list[str]:
     """Return configuration keys whose values differ between runs, ``seed`` last."""
     keys = sorted({k for r in runs for k in r.config})

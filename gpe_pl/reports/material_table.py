@@ -18,7 +18,17 @@ from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NE
 from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_ratio, median_of_means
-from gpe_pl.reports.finished_runs import Run, Values, axes_of, rollout_errors, shared_table, shared_trajectories, values_by_seed
+from gpe_pl.reports.finished_runs import (
+    NUM_STEPS,
+    VAL_INTERVAL,
+    Run,
+    Values,
+    axes_of,
+    rollout_errors,
+    shared_table,
+    shared_trajectories,
+    values_by_seed,
+)
 from gpe_pl.reports.parameter_curves import axis_label
 from gpe_pl.viz.saving import save_figure
 
@@ -31,7 +41,7 @@ FEWEST_SCENES = 6
 WITHOUT = "none"
 """Value of ``model.material_embedding`` of models without the parameter."""
 EMBEDDING = "model.material_embedding"
-MAY_DIFFER = {EMBEDDING, "seed", "training.num_steps", "checkpoint"}
+MAY_DIFFER = {EMBEDDING, "seed", NUM_STEPS, VAL_INTERVAL, "checkpoint"}
 """Settings in which a model without the parameter may differ from the model that it is compared with."""
 
 CURVES = {

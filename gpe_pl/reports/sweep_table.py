@@ -22,7 +22,9 @@ from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.files.markdown import table_row
 from gpe_pl.reports.body_table import body_lines
 from gpe_pl.reports.finished_runs import (
+    NUM_STEPS,
     UNSEEN_GROUPS,
+    VAL_INTERVAL,
     Run,
     Values,
     axes_of,
@@ -103,8 +105,14 @@ def report(folder: Path) -> None:
 
 
 def variants_of(runs: list[Run]) -> tuple[list[str], dict[Variant, list[Run]]]:
-    """Return the configuration keys in which runs differ, without the seed, and the runs by their values of these keys."""
+    """Return the configuration keys in which runs differ, without the seed, and the runs by their values of these keys.
+
+    Numbers of steps that follow from a budget of time are left out: those without which the runs still differ in the seed or another key.
+    """
     axes = [axis for axis in axes_of(runs) if axis != "seed"]
+    others = [axis for axis in axes if axis not in (NUM_STEPS, VAL_INTERVAL)]
+    if len({tuple(str(run.config.get(key)) for key in (*others, "seed")) for run in runs}) == len(runs):
+        axes = others
     variants: dict[Variant, list[Run]] = defaultdict(list)
     for run in runs:
         variants[tuple(str(run.config.get(axis)) for axis in axes)].append(run)
@@ -256,6 +264,7 @@ def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios
     header = [
         *names,
         "seeds",
+        "steps",
         "validation loss (one-step nMSE)",
         "forward time",
         "momentum error, test [m/s]",
@@ -271,6 +280,7 @@ def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios
                 [
                     *(key or (LEARNED,)),
                     str(len(runs)),
+                    _steps(runs),
                     f"{np.mean(losses):.4f} ({min(losses):.4f} – {max(losses):.4f})" if losses else "–",
                     f"{ratios[key]:.2f}" if key in ratios else "–",
                     mean_text(values_by_seed(runs, LEARNED, "test", "momentum_error", "full")),
@@ -425,6 +435,12 @@ def _failed(values: Values) -> str:
     numbers = [value for seed in values for value in seed.values()]
     failed = sum(not np.isfinite(value) for value in numbers)
     return f", {failed} of {len(numbers)} failed" if failed else ""
+
+
+def _steps(runs: list[Run]) -> str:
+    """Return the number of training steps as text: a range if it differs between seeds."""
+    steps = sorted({int(run.config[NUM_STEPS]) for run in runs if NUM_STEPS in run.config})
+    return " – ".join(f"{number:,}" for number in dict.fromkeys((*steps[:1], *steps[-1:]))) or "–"
 
 
 def _percent(values: Values) -> str:

@@ -20,6 +20,8 @@ from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import BOTH, bootstrap_interval, median_of_means
 from gpe_pl.reports.domain_table import TABLE_MD, TABLES, domain_of, model_of
 from gpe_pl.reports.finished_runs import (
+    NUM_STEPS,
+    VAL_INTERVAL,
     Run,
     axes_of,
     distinct_runs,
@@ -35,11 +37,8 @@ from gpe_pl.reports.stride_table import DIFFERENT_STARTS
 log = logging.getLogger(__name__)
 
 TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
-CONSEQUENCES = ("training.val_interval", "seed")
+CONSEQUENCES = (VAL_INTERVAL, "seed")
 """Keys that may differ between trials but are not compared: the validation interval, which follows from the number of steps, and the seed."""
-NUM_STEPS = "training.num_steps"
-"""Key of the number of steps. It counts as a compared setting only if runs with the same other settings and seed differ in it. Otherwise it follows from a
-time budget."""
 
 
 def compares_settings(runs: list[Run]) -> bool:

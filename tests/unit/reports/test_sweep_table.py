@@ -56,7 +56,7 @@ def cells(folder: Path, interaction: str) -> list[list[str]]:
 def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path) -> None:
     sweep_table.report_sweep(runs, finished_runs(runs))
     training, rollout, *_ = cells(runs, "negated")
-    assert training[1:3] == ["2", "0.3000 (0.2000 – 0.4000)"]
+    assert training[1:4] == ["2", "10", "0.3000 (0.2000 – 0.4000)"]
     assert rollout[1:] == ["test_unseen", "2 **2.0×**"]
     assert [row[1:] for row in cells(runs, "negated")[2:]] == [
         ["test_unseen/extrapolated", "2.5 **2.4×**"],
@@ -66,6 +66,30 @@ def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path)
     assert cells(runs, "odd")[1][2] == "8 0.5×"
     assert cells(runs, "odd_even")[1][2] == "4e+09 < 0.01×"
     assert cells(runs, "ballistic")[0][2] == "4"
+
+
+def set_steps(run: Path, num_steps: int, **model: str) -> None:
+    """Give a run another number of steps, and other settings of its model."""
+    path = run / "config.json"
+    config = json.loads(path.read_text())
+    config.pop("sha256", None)
+    training = config["training"] | {"num_steps": num_steps, "val_interval": num_steps // 2}
+    sealed.write(path, config | {"training": training, "model": config["model"] | model})
+
+
+def test_steps_that_follow_from_a_budget_are_no_setting(runs: Path) -> None:
+    for folder, num_steps in (("negated/0", 1200), ("negated/1", 1300), ("odd/0", 1000)):
+        set_steps(runs / folder, num_steps)
+    axes, variants = sweep_table.variants_of(finished_runs(runs))
+    assert axes == ["model.interaction"] and set(variants) == {(name,) for name, _ in ERRORS}
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    assert cells(runs, "negated")[0][1:3] == ["2", "1,200 – 1,300"]
+
+
+def test_steps_in_which_runs_differ_are_a_setting(runs: Path) -> None:
+    set_steps(runs / "negated" / "0", 1200, interaction="odd")  # with the seed of another run
+    axes, variants = sweep_table.variants_of(finished_runs(runs))
+    assert "training.num_steps" in axes and len(variants) == len(ERRORS)
 
 
 @pytest.mark.slow
@@ -126,14 +150,14 @@ def test_forward_times_are_shown_where_all_variants_have_them(runs: Path) -> Non
     ratios = {name: {"ratio": 1.0 + k / 4, "network": networks[name]} for k, name in enumerate(names)}
     sealed.write(runs / "forward_times.json", ratios)
     sweep_table.report_sweep(runs, finished_runs(runs))
-    assert [cells(runs, name)[0][3] for name in ("directed", "negated", "odd", "odd_even")] == ["1.00", "1.25", "1.50", "1.75"]
+    assert [cells(runs, name)[0][4] for name in ("directed", "negated", "odd", "odd_even")] == ["1.00", "1.25", "1.50", "1.75"]
     sealed.write(runs / "forward_times.json", {key: value for key, value in ratios.items() if key != "odd/0"})
     sweep_table.report_sweep(runs, finished_runs(runs))
-    assert cells(runs, "negated")[0][3] == "–"
+    assert cells(runs, "negated")[0][4] == "–"
     for changed in ({"network": "of another model", "ratio": 1.0}, 1.0):  # of runs that were deleted, and as earlier versions wrote it
         sealed.write(runs / "forward_times.json", {**ratios, "odd/0": changed})
         sweep_table.report_sweep(runs, finished_runs(runs))
-        assert cells(runs, "negated")[0][3] == "–"
+        assert cells(runs, "negated")[0][4] == "–"
 
 
 @pytest.mark.slow
