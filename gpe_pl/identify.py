@@ -133,11 +133,12 @@ def _calibrations(cfg: DictConfig, settings: Settings) -> tuple[dict[str, dict[s
     """Return the calibration of each simulator and unknown from an earlier results folder, and the digests of its motions; both empty without one.
 
     Raises:
-        ConfigError: there are no answers, too few, or answers of another model or with other settings.
+        ConfigError: there are no answers, too few with a stored value, or answers of another model or with other settings.
     """
     from gpe_pl.evaluation.identification.answer import MODEL, SOLVER, known_of, read_answers
     from gpe_pl.evaluation.identification.calibration import FewScenesError, calibrated
     from gpe_pl.files.run_folder import CONFIG, config_in
+    from gpe_pl.metrics.conformal import fewest_scenes
 
     if settings.calibration is None:
         if settings.level != Settings.level:
@@ -163,7 +164,13 @@ def _calibrations(cfg: DictConfig, settings: Settings) -> tuple[dict[str, dict[s
         raise ConfigError(f"{key}: was made with other settings ({shown}); identify its scenes again with these")
     found: dict[str, dict[str, Any]] = {}
     for kind, seen in answers.items():
-        for name, known in known_of(seen).items():
+        if not (by_name := known_of(seen)):
+            other = "" if len(kinds) == 1 else f", or choose simulator={next(each for each in kinds if each != kind)}"
+            raise ConfigError(
+                f"{key}: simulator={kind}: none of {len(seen)} calibration scenes has a stored value to compare with; intervals of "
+                f"{100 * settings.level:g} % need at least {fewest_scenes(settings.level)} that do: identify scenes with known values{other}"
+            )
+        for name, known in by_name.items():
             try:
                 found.setdefault(kind, {})[name] = calibrated(known, settings.level)
             except FewScenesError as error:
