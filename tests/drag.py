@@ -11,7 +11,7 @@ from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 
 DT, ANGLE = 0.01, 31.0
-BOUNDS = {"sand.friction_angle": (20.0, 42.5), "fluid.kinematic_viscosity": (1e-3, 1.0)}
+BOUNDS, FLUID_BOUNDS = {"sand.friction_angle": (20.0, 42.5)}, {"fluid.kinematic_viscosity": (1e-3, 1.0)}
 
 
 @dataclass(frozen=True)

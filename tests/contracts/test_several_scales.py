@@ -18,13 +18,21 @@ from gpe_pl.data.dataset import StartKey
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
 from gpe_pl.data.statistics import acceleration_std
+from gpe_pl.evaluation.identification.answer import read_answers
+from gpe_pl.evaluation.identification.observations import ObservationSettings
+from gpe_pl.evaluation.identification.results import Task
+from gpe_pl.evaluation.identification.scene import identify_parameters
+from gpe_pl.evaluation.identification.search import SearchSettings
+from gpe_pl.evaluation.identification.shooting import ShootingSettings
 from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.topology import GraphError
+from gpe_pl.identify import identify_all
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator, SceneError
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.blocks import Standardize
+from gpe_pl.rollout.loop import rollout
 from gpe_pl.system.compiled import unfused
 from gpe_pl.training.push_forward import Excursions
 from gpe_pl.trajectory.state import State
@@ -128,6 +136,19 @@ def test_the_added_edge_features_are_the_gaps_one_frame_later() -> None:
     even = build.at(h, dt)(s)["sand", "radius", "sand"].even
     assert even[0, 0].item() == pytest.approx(0.3 / 0.2, abs=1e-5)
     assert even[0, 4].item() == pytest.approx(0.1 / 0.2, abs=1e-5)
+
+
+def test_unknowns_of_a_scene_of_another_scale_are_found(tmp_path: Path) -> None:
+    model = learned(built())
+    larger = model.at(LONGER * model.builder.metadata.spacing, SLOWER * model.builder.metadata.frame_dt)
+    own = larger.builder.metadata
+    seen = rollout(larger, similar(scenes.state(20, materials=("sand",), history=2)).to_torch(), 6, own)
+    seen = replace(seen, material_params=np.full_like(seen.material_params, 30.0), is_prediction=False)
+    shots, few = ShootingSettings(horizon=2, num_windows=1), SearchSettings(num_scanned=3, max_evaluations=1)
+    task = Task(model, None, False, {"sand.friction_angle": (1.0, 60.0)}, ("model",), ObservationSettings(), shots, few, {})
+    assert identify_all(task, [("larger", seen)], tmp_path) == []
+    answer = identify_parameters(model, seen, bounds=task.bounds, shooting_settings=shots, search_settings=few)
+    assert answer.values == read_answers(tmp_path, "model")[0].values
 
 
 def test_models_of_one_scale_refuse_others_as_before() -> None:

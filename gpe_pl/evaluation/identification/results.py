@@ -30,12 +30,12 @@ from gpe_pl.evaluation.identification.pictures import misfit_figure
 from gpe_pl.evaluation.identification.scene import SolverError, identify_parameters, solver_bounds, solver_of, trained_bounds
 from gpe_pl.evaluation.identification.search import SearchSettings
 from gpe_pl.evaluation.identification.shooting import ShootingSettings, started
-from gpe_pl.evaluation.identification.unknowns import Bounds, Unknowns, unknowns_of
+from gpe_pl.evaluation.identification.unknowns import Bounds, Unknowns, check_bounds, unknowns_of
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.conformal import coverage, fewest_scenes, interval_score
-from gpe_pl.rollout.loop import Simulator, rollout
+from gpe_pl.rollout.loop import rollout
 from gpe_pl.system.progress import progress_bar
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.figures import rollout_figure
@@ -75,9 +75,11 @@ class Task:
 
     def run(self, name: str, trajectory: Trajectory, folder: Path) -> Iterator[str]:
         """Identify one scene, write the answers and pictures into a folder, and yield lines for readers."""
-        self.model.check_scene(trajectory.metadata)
+        model = self.model.on(trajectory.metadata)
+        check_bounds(self.bounds, trajectory.metadata)
         observed = Observations.of(trajectory, self.observations)
-        bounds = {**solver_bounds(trajectory.metadata), **trained_bounds(self.model), **self.bounds}
+        preferred = {**trained_bounds(model), **self.bounds}  # models may know more materials than the data set has
+        bounds = {name: preferred.get(name, ends) for name, ends in solver_bounds(trajectory.metadata).items()}
         if observed.digest in self.calibrated_on:
             raise MotionError(f"{name}: this motion is one of those that the calibration is from; calibrate on other scenes")
         answers: dict[str, Answer] = {}
@@ -87,7 +89,7 @@ class Task:
             path = answer_path(folder, name, kind)
             if not path.exists():
                 try:
-                    simulator = self.model if kind == MODEL else solver_of(trajectory.metadata)
+                    simulator = model if kind == MODEL else solver_of(trajectory.metadata)
                 except SolverError as error:
                     if len(self.simulators) == 1:
                         raise
@@ -114,19 +116,18 @@ class Task:
 
     def _motion(self, trajectory: Trajectory, sought: Unknowns, answers: Mapping[str, Answer]) -> Figure:
         """Return a figure of the observed motion beside rollouts with the answers."""
-        first = 0 if sought.needs_start else self.model.builder.config.history
+        model = self.model.on(trajectory.metadata).configured(clamps_parameters=False)
+        first = 0 if sought.needs_start else model.builder.config.history
         number = min(SHOWN_FRAMES, trajectory.num_frames - 1 - first)
         shown: dict[str, Trajectory] = {}
         for kind, answer in answers.items():
             z = np.array([(u.coordinate(v.raw) - u.coordinate(u.low)) / u.range for u, v in zip(sought.items, answer.values, strict=True)])
-            simulator: Simulator = self.model if kind == MODEL else solver_of(trajectory.metadata)
             if kind == MODEL:
-                model = self.model.configured(clamps_parameters=False)
                 state = trajectory.state(0).to_torch() if sought.needs_start else model.initial_state(trajectory, first)
                 start = started(model, sought, state, torch.from_numpy(z), trajectory.metadata)
                 shown[kind] = rollout(model, start, number, trajectory.metadata)
             else:
-                run = rollout(simulator, sought.applied(trajectory.state(0), z), first + number, trajectory.metadata)
+                run = rollout(solver_of(trajectory.metadata), sought.applied(trajectory.state(0), z), first + number, trajectory.metadata)
                 shown[kind] = replace(run, is_prediction=True).frames(first, run.num_frames)
         return rollout_figure(trajectory.frames(first, first + number + 1), shown)
 

@@ -16,7 +16,7 @@ from gpe_pl.evaluation.identification.observations import Observations
 from gpe_pl.evaluation.identification.profile import Profile
 from gpe_pl.evaluation.identification.search import Found, SearchSettings, search
 from gpe_pl.evaluation.identification.shooting import FAILED, Shooting, ShootingError, ShootingSettings, shooting
-from gpe_pl.evaluation.identification.unknowns import Bounds, UnknownError, unknowns_of
+from gpe_pl.evaluation.identification.unknowns import Bounds, UnknownError, check_bounds, unknowns_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import Simulator
 from gpe_pl.schema import MATERIALS
@@ -54,7 +54,7 @@ def identify_parameters(
         print(identify_parameters(simulator, trajectory))  # friction angle of sand 31.2° (90 %: 30.1–32.4)
 
     Args:
-        simulator: trained model, or a solver.
+        simulator: trained model, or a solver. Models of several scales take that of the scene.
         observed: a trajectory, or observations with missing parts or noise.
         unknowns: names ``MATERIAL``, ``MATERIAL.PARAMETER``, ``velocity`` or ``gravity``, or one such name; None takes all material parameters.
         per_body: give each body values of its own.
@@ -70,6 +70,9 @@ def identify_parameters(
     """
     seen = observed if isinstance(observed, Observations) else Observations.of(observed)
     began, processor = time.monotonic(), time.process_time()
+    check_bounds(bounds or {}, seen.trajectory.metadata)
+    if isinstance(simulator, LearnedSimulator):
+        simulator = simulator.on(seen.trajectory.metadata)
     ranges = {**(trained_bounds(simulator) if isinstance(simulator, LearnedSimulator) else {}), **(bounds or {})}
     sought = unknowns_of(seen.completed, unknowns, ranges, per_body, seen.first_frame, seen.trajectory)
     rollouts = shooting(simulator, seen, sought, shooting_settings)

@@ -17,7 +17,7 @@ from gpe_pl.schema import MATERIALS, MaterialParameter, node_code
 from gpe_pl.trajectory.boundary import search_tree
 from gpe_pl.trajectory.cells import bodies, components
 from gpe_pl.trajectory.state import State
-from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from gpe_pl.viz.captions import materials_of, parameter_name, parameter_value
 
 VELOCITY: Literal["velocity"] = "velocity"
@@ -178,8 +178,6 @@ def unknowns_of(
         UnknownError: the scene has no such unknown, or a parameter has no bounds. The message names it.
     """
     found: list[Unknown] = []
-    if misspelt := sorted(set(ranges) - PARAMETERS):
-        raise UnknownError(f"bounds: {misspelt[0]!r} is no MATERIAL.PARAMETER{did_you_mean(misspelt[0], sorted(PARAMETERS))}")
     groups = scene_bodies(trajectory, first_frame) if per_body else []
     names = [wanted] if isinstance(wanted, str) else wanted
     for name in materials_of(trajectory) if names is None else names:
@@ -198,6 +196,19 @@ def unknowns_of(
     if twice := [name for name in named if named.count(name) > 1]:
         raise UnknownError(f"unknowns: {twice[0]} is named twice; name a parameter, or its material, once")
     return Unknowns(tuple(found))
+
+
+def check_bounds(bounds: Bounds, metadata: Metadata) -> None:
+    """Raise an error for bounds of a parameter that no scene of a data set has.
+
+    Raises:
+        UnknownError: a name is no parameter, or is one of another material. The message names it.
+    """
+    own = {f"{material}.{parameter.name}" for material in metadata.materials for parameter in metadata.parameters_of(material)}
+    for name in sorted(set(bounds) - own):
+        if name not in PARAMETERS:
+            raise UnknownError(f"bounds: {name!r} is no MATERIAL.PARAMETER{did_you_mean(name, sorted(PARAMETERS))}")
+        raise UnknownError(f"bounds: {name} is no unknown of these scenes, which have {', '.join(sorted(own))}; leave it out")
 
 
 def scene_bodies(trajectory: Trajectory, frame: int = 0) -> list[np.ndarray]:
