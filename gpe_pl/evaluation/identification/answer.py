@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.identification.calibration import Calibration, Known
 from gpe_pl.evaluation.identification.profile import Profile
@@ -179,7 +181,8 @@ def known_of(answers: Iterable[Answer]) -> dict[str, list[Known]]:
             if value.truth is not None:
                 low, high = map(value.coordinate, value.bounds)
                 profile = Profile.of(((value.coordinate(row[k]), row[-1]) for row in answer.tried), (low, high))
-                known = Known(value.coordinate(value.raw), value.coordinate(value.truth), profile, answer.scene)
+                truth = next((end for end in value.bounds if np.float32(end) == np.float32(value.truth)), value.truth)  # stored in float32
+                known = Known(value.coordinate(value.raw), value.coordinate(truth), profile, answer.scene)
                 found.setdefault(value.name.partition("#")[0], []).append(known)
     return found
 

@@ -7,10 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from gpe_pl.evaluation.identification.answer import Answer, Value
 
 COLORS = {"model": "tab:blue", "solver": "tab:orange"}
+FEW_DECADES = 50
+"""Ratio of the bounds below which a logarithmic axis also has ticks between powers of ten."""
 
 
 def misfit_figure(answers: Mapping[str, Answer]) -> Figure:
@@ -24,6 +27,10 @@ def misfit_figure(answers: Mapping[str, Answer]) -> Figure:
             axes.axvline(value.truth, color="black", linestyle=":", label="stored value")
         if value.is_log:
             axes.set_xscale("log")
+            if value.bounds[1] < FEW_DECADES * value.bounds[0]:  # powers of ten alone could be a single tick
+                axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set(xlabel=f"{value.label} [{value.unit}]", ylabel="misfit above the smallest")
         axes.legend(fontsize=8)
     return figure

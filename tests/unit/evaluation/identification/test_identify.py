@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import count
+from itertools import count, pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,6 +18,7 @@ from gpe_pl.evaluation.identification.answer import Answer, AnswerError, known_o
 from gpe_pl.evaluation.identification.calibration import FewScenesError, Known, calibrated, cross_calibrated
 from gpe_pl.evaluation.identification.gradient_check import GradientCheck, gradient_check
 from gpe_pl.evaluation.identification.observations import ObservationError, Observations, ObservationSettings
+from gpe_pl.evaluation.identification.pictures import misfit_figure
 from gpe_pl.evaluation.identification.profile import Profile
 from gpe_pl.evaluation.identification.results import MotionError, Task, write_table
 from gpe_pl.evaluation.identification.scene import SolverError, identify_parameters, solver_of
@@ -35,7 +36,7 @@ from gpe_pl.scenes.scene import Scene
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests import scenes
-from tests.drag import ANGLE, BOUNDS, DT, Drag, thrown
+from tests.drag import ANGLE, BOUNDS, DT, FLUID_BOUNDS, Drag, thrown
 from tests.runs import compose
 from tests.unit.training.test_unroll_gradients import Double, simulator_of, slow, unroll
 
@@ -53,8 +54,19 @@ def test_a_parameter_is_found_whatever_is_stored() -> None:
 
 def test_logarithmic_parameters_are_found() -> None:
     simulator = Drag(rate=20.0)
-    answer = identify_parameters(simulator, thrown(0.03, "fluid", simulator), bounds=BOUNDS)
+    answer = identify_parameters(simulator, thrown(0.03, "fluid", simulator), bounds=FLUID_BOUNDS)
     assert answer.values[0].estimate == pytest.approx(0.03, rel=0.02)
+
+
+@pytest.mark.parametrize("high", [0.02, 0.2, 20.0])
+def test_tick_labels_of_misfits_do_not_overlap(high: float) -> None:
+    bounds = {"fluid.kinematic_viscosity": (0.003, high)}
+    figure = misfit_figure({"solver": identify_parameters(Drag(rate=20.0), thrown(0.03, "fluid"), bounds=bounds)})
+    figure.draw_without_rendering()
+    labels = sorted((tick.label1 for tick in figure.axes[0].xaxis._update_ticks()), key=lambda label: label.get_position()[0])
+    boxes = [label.get_window_extent() for label in labels if label.get_text()]
+    assert len(boxes) >= 2
+    assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
 
 
 @pytest.mark.slow
@@ -133,6 +145,11 @@ def test_rollouts_that_fail_do_not_win() -> None:
         (["sand", "sand.friction_angle"], BOUNDS, r"unknowns: sand\.friction_angle is named twice"),
         (["velocity.x"], BOUNDS, r"unknowns: 'velocity\.x': velocity has no parts; write velocity"),
         (None, {"sand.friction": (10.0, 50.0)}, r"bounds: 'sand\.friction' is no MATERIAL\.PARAMETER; did you mean 'sand\.friction_angle'"),
+        (
+            None,
+            {**BOUNDS, **FLUID_BOUNDS},
+            r"bounds: fluid\.kinematic_viscosity is no unknown of these scenes, which have sand\.friction_angle",
+        ),
         (None, {"sand.friction_angle": (50.0, 10.0)}, r"bounds of sand\.friction_angle: \[50, 10\]: the first must be below the second"),
         (None, {"sand.friction_angle": (-50.0, 10.0)}, r"bounds of sand\.friction_angle: \[-50, 10\]: must be finite and not negative"),
     ],
@@ -491,6 +508,22 @@ def test_a_calibration_of_another_search_is_refused(tmp_path: Path, there: dict[
         _calibrations(cfg, settings)
 
 
+@pytest.mark.parametrize(("simulator", "advice"), [("solver", "known values$"), ("both", "known values, or choose simulator=solver$")])
+def test_a_calibration_without_stored_values_is_refused(tmp_path: Path, simulator: Any, advice: str) -> None:
+    cfg = compose("identify", "checkpoint=sand", "trajectory=scenes", f"simulator={simulator}", f"calibration={tmp_path}")
+    identify_parameters(Drag(), thrown(np.repeat([24.0, 38.0], 9)), bounds=BOUNDS, scene="two_bodies").write(tmp_path)
+    sealed.write(tmp_path / "config.json", _identity(cfg))
+    number, kind = (1, "solver") if simulator == "solver" else (0, "model")
+    with pytest.raises(ConfigError, match=rf"simulator={kind}: none of {number} .* intervals of 95 % need at least 19 that do: .*{advice}"):
+        _calibrations(cfg, Settings("sand", "scenes", simulator=simulator, calibration=str(tmp_path), level=0.95))
+
+
+def test_a_true_value_at_a_bound_is_not_beyond_it_because_of_rounding() -> None:
+    low = 10.7  # the nearest float32 is smaller
+    (known,) = known_of([identify_parameters(Drag(), thrown(low), bounds={"sand.friction_angle": (low, 42.5)})])["sand.friction_angle"]
+    assert known.profile.above(known.truth) < 0.01
+
+
 @pytest.mark.slow
 def test_a_calibration_with_true_values_beyond_the_bounds_is_refused(tmp_path: Path) -> None:
     cfg = compose("identify", "checkpoint=sand", "trajectory=scenes", "simulator=solver", f"calibration={tmp_path}")
@@ -515,6 +548,8 @@ def test_a_scene_that_is_too_short_is_left_out(tmp_path: Path, monkeypatch: pyte
     assert [answer.scene for answer in read_answers(tmp_path, "model")] == ["long"]
     with pytest.raises(ConfigError, match="no scene can be identified; brief: "):
         identify_all(task, [("brief", seen.frames(0, 1))], tmp_path)
+    with pytest.raises(UnknownError, match=r"bounds: solid\.youngs_modulus is no unknown of these scenes"):
+        identify_all(replace(task, bounds={"solid.youngs_modulus": (1e5, 2e5)}), [("long", seen)], tmp_path)
 
 
 @pytest.mark.slow
