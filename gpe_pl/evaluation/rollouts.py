@@ -26,7 +26,7 @@ from gpe_pl.learned.ensemble import LearnedEnsemble, configured, members_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, rollout_metrics
 from gpe_pl.nn.stores import predicted_rows
-from gpe_pl.schema import Split, param_names
+from gpe_pl.schema import param_names
 from gpe_pl.system.progress import Bars, no_bar
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
@@ -59,8 +59,7 @@ def evaluate(
 
     - ``one_step_nmse``: one value for each split (see ``one_step_nmse``).
     - ``num_good_frames``: number of frames that the rollout reached.
-    - ``edges_per_node``: number of edges within the radius divided by the number of dynamic nodes, in the graph of the middle frame of the ground truth. A pair
-      of nodes has one edge.
+    - ``edges_per_node``: edges within the radius, one per pair of nodes, per dynamic node, in the graph of the middle frame of the ground truth.
     - ``fraction_outside_at_end``: fraction of particles inside a wall or obstacle in the last frame.
     - ``fraction_corrected``: fraction of particle-steps that containment corrects.
     - ``fraction_outside_uncontained``: fraction of particle-frames inside a wall or obstacle with containment off, for the first ``settings.num_uncontained``
@@ -99,33 +98,32 @@ def evaluate(
     check_formats(settings, simulator)
     run_dir.mkdir(parents=True, exist_ok=True)
     if MODELS & {*settings.export}:  # before the rollouts, which would be lost with a model that cannot be written
-        films = [film for split in settings.splits for film in _films(root, split, settings, first, start_frame, stride)]
-        write_models(run_dir, members_of(simulator)[0], label, films, settings.export)
+        write_models(run_dir, members_of(simulator)[0], label, [*_films(root, settings, first, start_frame, stride)], settings.export)
     predictor = Predictor(simulator, settings, label, controls, stride, start_frame, seconds=[], bars=bars)
-    rows = list[Row]()
-    for split in settings.splits:
+    rows, files = list[Row](), {split: SplitFiles(run_dir, split, label, settings) for split in settings.splits}
+    for split, of_split in files.items():
         rows.append(Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split, stride=stride)))
-        files = SplitFiles(run_dir, split, label, settings)
         for scene in predictor.scenes(root, split):
             about = (split, scene.number, scene.truth.metadata.parameter_group, _parameter(scene.trajectory))
             rows += _rows(scene, about, label, labels(settings.horizons, frame_dt))
             rows += see(scene, about) if see else []
-            files.add(scene, about)
-        files.finish()
+            of_split.add(scene, about)
+        of_split.write_quantities()
     write_cost(run_dir, predictor.seconds, frame_dt, first.acceleration_std.is_cuda)
-    write_rows(run_dir / "metrics.csv", rows)  # last, because a run with metrics counts as finished
+    write_rows(run_dir / "metrics.csv", rows)  # after all other results, as a run with metrics is finished; figures that fail lose none
+    for of_split in files.values():
+        of_split.draw()
     return rows
 
 
-def _films(
-    root: Path, split: Split, settings: EvaluationSettings, simulator: LearnedSimulator, start_frame: int, stride: int
-) -> Iterator[SolverFilm]:
-    """Check all scenes of a split that are evaluated, and yield those that get pictures."""
+def _films(root: Path, settings: EvaluationSettings, simulator: LearnedSimulator, start_frame: int, stride: int) -> Iterator[SolverFilm]:
+    """Check all scenes that are evaluated, and yield those that get pictures."""
     wanted = math.inf if settings.num_trajectories is None else settings.num_trajectories
-    for number, trajectory in takewhile(lambda scene: scene[0] < wanted, long_enough(root, split, start_frame, stride)):
-        check_scene(settings, trajectory, simulator.builder.metadata)
-        if number < settings.num_pictures:
-            yield SolverFilm(f"{split} {number}", trajectory)
+    for split in settings.splits:
+        for number, trajectory in takewhile(lambda scene: scene[0] < wanted, long_enough(root, split, start_frame, stride)):
+            check_scene(settings, trajectory, simulator.builder.metadata)
+            if number < settings.num_pictures:
+                yield SolverFilm(f"{split} {number}", trajectory)
 
 
 def _scene_in(root: Path, split: str, stride: int) -> Metadata:

@@ -25,7 +25,7 @@ COLUMNS = ("split", "trajectory", "parameter_group", "parameter", "quantity", "u
 
 @dataclass
 class SplitFiles:
-    """Writes the files of a split while its scenes are evaluated.
+    """Writes the files of a split: those of its first scenes while they are evaluated, and those about all scenes after that.
 
     Attributes:
         run_dir: folder for the files.
@@ -40,6 +40,7 @@ class SplitFiles:
     settings: EvaluationSettings
     _curves: dict[str, list[np.ndarray]] = field(default_factory=dict)
     _numbers: list[tuple[About, str, Quantity, float]] = field(default_factory=list)
+    _materials: dict[int, list[str]] = field(default_factory=dict)
     _truth: Trajectory | None = None
 
     def add(self, scene: PredictedScene, about: About) -> None:
@@ -57,21 +58,32 @@ class SplitFiles:
         if self.settings.quantities:
             self._add_quantities(scene, about)
 
-    def finish(self) -> None:
-        """Write the files about all scenes of the split."""
-        if self._truth is None:
+    def write_quantities(self) -> None:
+        """Write the table of quantities, if there are some."""
+        if not self._numbers:
             return
-        if self._curves and self.settings.num_pictures:
+        table = io.StringIO(newline="")
+        writer = csv.writer(table)
+        writer.writerow(COLUMNS)
+        writer.writerows([*about, name, quantity.unit, quantity.value, predicted] for about, name, quantity, predicted in self._numbers)
+        replace_text(self.run_dir / f"quantities_{self.split}.csv", table.getvalue())
+
+    def draw(self) -> None:
+        """Draw the figures about all scenes of the split."""
+        if self._truth is None or not self.settings.num_pictures:
+            return
+        if self._curves:
             path = self.run_dir / f"error_curve_{self.split}.png"
             write_error_curve(path, self._curves, self._truth.metadata.frame_dt, self.settings.export)
         if self._numbers:
-            self._write_numbers()
+            self._draw_quantities()
 
     def _add_quantities(self, scene: PredictedScene, about: About) -> None:
-        from gpe_pl.viz.captions import describe
+        from gpe_pl.viz.captions import describe, materials_of
         from gpe_pl.viz.quantities import courses_figure
 
         truth, prediction = scene.truth, scene.predictions[self.label]
+        self._materials[about[1]] = materials_of(truth)
         of_truth = quantities(truth)
         of_prediction = quantities(prediction) if prediction.num_frames > 1 else {}
         for name, quantity in of_truth.items():
@@ -88,26 +100,22 @@ class SplitFiles:
             figure = courses_figure(courses, truth.metadata.frame_dt, f"{self.split} {about[1]}: {describe(truth)}")
             save(figure, self.run_dir / f"quantities_{self.split}_{about[1]:02d}.png", self.settings.export)
 
-    def _write_numbers(self) -> None:
+    def _draw_quantities(self) -> None:
         from gpe_pl.viz.captions import parameter_name, parameter_value
-        from gpe_pl.viz.quantities import parity_figure
+        from gpe_pl.viz.quantities import Numbers, parity_figure
 
-        table = io.StringIO(newline="")
-        writer = csv.writer(table)
-        writer.writerow(COLUMNS)
-        numbers: dict[str, tuple[str, list[tuple[float, float]]]] = {}
-        parameters = {about[1]: about[3] for about, *_ in self._numbers}
-        for about, name, quantity, predicted in self._numbers:
+        numbers: dict[str, Numbers] = {}
+        known: dict[int, float] = {}  # by scene
+        for (_, scene, _, parameter), name, quantity, predicted in self._numbers:
             assert quantity.value is not None
-            writer.writerow([*about, name, quantity.unit, quantity.value, predicted])
-            numbers.setdefault(name, (quantity.unit, []))[1].append((quantity.value, predicted))
-        replace_text(self.run_dir / f"quantities_{self.split}.csv", table.getvalue())
-        if not self.settings.num_pictures:
-            return
-        assert self._truth is not None
-        material = self._truth.metadata.materials[0]
-        parameter, known = MATERIALS[material][0], [value for value in parameters.values() if np.isfinite(value)]
-        span = f", {parameter_name(parameter)} {parameter_value(parameter, min(known), max(known))}" if known else ""
-        title = f"{self.split}, {len(parameters)} scenes of {', '.join(self._truth.metadata.materials)}{span}"
-        figure = parity_figure(numbers, [*parameters.values()], f"{parameter_name(parameter)} [{parameter.unit}]", title)
-        save(figure, self.run_dir / f"parity_{self.split}.png", self.settings.export)
+            numbers.setdefault(name, (quantity.unit, []))[1].append((parameter, quantity.value, predicted))
+            known |= {scene: parameter} if np.isfinite(parameter) else {}
+        occurring = dict.fromkeys(material for own in self._materials.values() for material in own)
+        firsts = {(own.name, own.unit): own for scene in known for own in (MATERIALS[material][0] for material in self._materials[scene])}
+        label, span = "material parameter", ""
+        if len(firsts) == 1:
+            (first,) = firsts.values()
+            label = f"{parameter_name(first)} [{first.unit}]"
+            span = f", {parameter_name(first)} {parameter_value(first, min(known.values()), max(known.values()))}"
+        title = f"{self.split}, {len({about[1] for about, *_ in self._numbers})} scenes of {', '.join(occurring)}{span}"
+        save(parity_figure(numbers, label, title), self.run_dir / f"parity_{self.split}.png", self.settings.export)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-from gpe_pl.viz.coloring import PALETTE
+from gpe_pl.viz.coloring import PALETTE, REFERENCE
 from gpe_pl.viz.film_strip import new_figure
 
 PANEL = (2.3, 2.0)
@@ -19,8 +21,9 @@ PANEL = (2.3, 2.0)
 
 Course = tuple[str, Mapping[str, Float[np.ndarray, "_"]]]
 """Unit of a quantity, and its values of frames 1, 2, … by simulator. A rollout that stopped early has fewer."""
-Numbers = tuple[str, Sequence[tuple[float, float]]]
-"""Unit of a quantity, and its true and predicted value in each scene; the prediction is NaN where the rollout stopped early."""
+Numbers = tuple[str, list[tuple[float, float, float]]]
+"""Unit of a quantity; and material parameter, true and predicted value in each scene that has the quantity. A parameter is NaN where a scene has several
+values or none, and a prediction where the rollout stopped early."""
 
 
 def courses_figure(courses: Mapping[str, Course], frame_dt: float, title: str) -> Figure:
@@ -47,24 +50,25 @@ def courses_figure(courses: Mapping[str, Course], frame_dt: float, title: str) -
     return figure
 
 
-def parity_figure(numbers: Mapping[str, Numbers], parameter: Sequence[float], parameter_label: str, title: str) -> Figure:
+def parity_figure(numbers: Mapping[str, Numbers], parameter_label: str, title: str) -> Figure:
     """Draw one number per scene of each quantity: above predicted against true with the line of equality, below both against the parameter.
+
+    Scenes without a parameter value are grey above, and not shown below. If no scene has one, the lower row is left out.
 
     Args:
         numbers: quantities by name.
-        parameter: material parameter of each scene; without finite values the lower row is left out.
         parameter_label: name and unit of the parameter.
         title: heading of the figure.
     """
-    value = np.asarray(parameter, float)
-    rows = 2 if np.isfinite(value).any() else 1
+    values = np.array([parameter for _, scenes in numbers.values() for parameter, *_ in scenes])
+    rows = 2 if np.isfinite(values).any() else 1
     if rows == 2:  # one scale for all panels, because points without a number of a quantity are left out there
-        colors = ScalarMappable(Normalize(np.nanmin(value), np.nanmax(value)), "viridis")
+        colors = ScalarMappable(Normalize(np.nanmin(values), np.nanmax(values)), colormaps["viridis"].with_extremes(bad=REFERENCE))
     figure = new_figure(max(PANEL[0] * len(numbers), 4.0), PANEL[1] * rows + 0.3)
     figure.set_layout_engine("constrained")
     panels = figure.subplots(rows, len(numbers), squeeze=False)
-    for axes, (name, (unit, pairs)) in zip(panels.T, numbers.items(), strict=True):
-        true, predicted = np.asarray(pairs, float).T
+    for axes, (name, (unit, scenes)) in zip(panels.T, numbers.items(), strict=True):
+        value, true, predicted = np.asarray(scenes, float).T
         ends = np.array([np.nanmin([true, predicted]), np.nanmax([true, predicted])])
         ends = ends + np.array([-0.05, 0.05]) * max(np.ptp(ends), 1e-12)
         axes[0].plot(ends, ends, ":", color="0.5", linewidth=1)
@@ -80,6 +84,9 @@ def parity_figure(numbers: Mapping[str, Numbers], parameter: Sequence[float], pa
         bar.ax.tick_params(labelsize=6)
         bar.ax.yaxis.get_offset_text().set_fontsize(6)
         panels[1, 0].legend(fontsize=6.5, frameon=False)
+        if not np.isfinite(values).all():
+            grey = Line2D([], [], linestyle="", marker="o", markersize=4, color=REFERENCE, label="several values or none")
+            panels[0, 0].legend(handles=[grey], fontsize=6.5, frameon=False)
     figure.suptitle(title, fontsize=8)
     return figure
 

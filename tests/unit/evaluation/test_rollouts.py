@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gpe_pl.evaluation import split_files
 from gpe_pl.evaluation.horizons import labels, time_of
 from gpe_pl.evaluation.metric_rows import MetricsError, Row, read_rows, write_rows
 from gpe_pl.evaluation.predictions import _cost_of_skipping, _fraction_outside
@@ -69,6 +70,25 @@ def test_scenes_keep_their_numbers_if_others_are_too_short(
     rows = evaluate(simulator, tmp_path / "data", settings, tmp_path / "run")
     assert {row.trajectory for row in rows} == {-1, *numbers}
     assert {row.trajectory for row in rows if row.metric == "fraction_outside_uncontained"} == {1}
+
+
+@pytest.mark.slow
+def test_figures_that_cannot_be_drawn_do_not_lose_the_metrics(
+    new_trajectory: Callable[..., Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = new_trajectory(num_frames=7, seed=2)
+    write_shard(tmp_path / "data" / "test" / "shard-00000.h5", [whole])
+    builder = GraphBuilder(GraphConfig(history=2), whole.metadata)
+    simulator = LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=4), builder).eval()
+
+    def fails(*_: object) -> None:
+        raise RuntimeError("cannot draw")
+
+    monkeypatch.setattr(split_files, "write_pictures", lambda *_: None)
+    monkeypatch.setattr(split_files, "write_error_curve", fails)
+    with pytest.raises(RuntimeError, match="cannot draw"):
+        evaluate(simulator, tmp_path / "data", EvaluationSettings(["test"], num_pictures=1), tmp_path / "run")
+    assert {row.trajectory for row in read_rows(tmp_path / "run" / "metrics.csv")} == {-1, 0}
 
 
 def test_rows_survive_the_file(tmp_path: Path) -> None:

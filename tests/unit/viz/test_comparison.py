@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from matplotlib import colormaps
+from matplotlib.colors import to_rgba
 
 from gpe_pl.metrics import Interval
+from gpe_pl.viz.coloring import REFERENCE
 from gpe_pl.viz.comparison import CostAndError, comparison_figure, cost_error_figure, parameter_figure
 from gpe_pl.viz.coverage import CoverageCurves, coverage_figure
 from gpe_pl.viz.quantities import parity_figure
@@ -90,9 +92,20 @@ def test_every_level_of_costs_and_errors_has_its_line() -> None:
 
 
 def test_colours_of_a_parity_figure_have_one_scale() -> None:
-    numbers = {"height": ("m", [(1.0, 1.1), (2.0, 2.1), (3.0, 3.1)]), "peak stress": ("Pa", [(1.0, np.nan), (2.0, np.nan), (3.0, np.nan)])}
-    figure = parity_figure(numbers, [1e6, 3e6, 5e6], "Young's modulus [Pa]", "solids")
+    heights = [(1e6, 1.0, 1.1), (3e6, 2.0, 2.1), (5e6, 3.0, 3.1)]
+    numbers = {"height": ("m", heights), "peak stress": ("Pa", [(value, true, np.nan) for value, true, _ in heights])}
+    figure = parity_figure(numbers, "Young's modulus [Pa]", "solids")
     bar = figure.axes[-1]
     assert bar.get_ylim() == pytest.approx((1e6, 5e6))
     colors = figure.axes[0].collections[0].get_facecolors()
     np.testing.assert_allclose(colors, colormaps["viridis"]([0.0, 0.5, 1.0]))
+
+
+def test_scenes_without_a_parameter_are_visible_in_a_parity_figure() -> None:
+    numbers = {"run-out": ("m", [(30.0, 1.0, 1.1), (np.nan, 2.0, 2.1), (40.0, 3.0, 2.9)])}
+    figure = parity_figure(numbers, "friction angle [deg]", "3 scenes")
+    colors = figure.axes[0].collections[0].get_facecolors()
+    np.testing.assert_allclose(colors[1], to_rgba(REFERENCE))
+    assert colors[:, 3].tolist() == [1.0, 1.0, 1.0]
+    legend = figure.axes[0].get_legend()
+    assert legend is not None and [text.get_text() for text in legend.get_texts()] == ["several values or none"]
