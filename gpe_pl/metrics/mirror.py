@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.trajectory.boundary import nodes_beside_shapes
+from gpe_pl.trajectory.cells import bodies, cell_edges
 from gpe_pl.trajectory.reflection import Reflection, without_gravity
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -43,9 +44,11 @@ class Mirror:
 def mirrors(truth: Trajectory) -> list[Mirror]:
     """Return the vertical planes about which a scene is symmetric.
 
-    A scene is symmetric if its first frame equals its mirror image in positions, velocities, masses and materials, if given motions and forces do in all
-    frames, and if the walls and obstacles near nodes of any frame do, with their friction and restitution. Mesh cells are not compared, because the diagonals
-    of a lattice of triangles are rarely symmetric. The list is empty in periodic domains, and if the boundary moves or has nodes that belong to no shape.
+    A scene is symmetric if its first frame equals its mirror image in positions, velocities, masses and materials, in the bodies that meshes and rigid bodies
+    make of its nodes, and in the rest shapes of meshes; if given motions and forces do in all frames; and if the walls and obstacles near nodes of any frame
+    do, with their friction and restitution. Mesh cells themselves are not compared, because the diagonals of a lattice of triangles are rarely symmetric:
+    nodes of one cell need partners in one body that are as far apart at rest. The list is empty in periodic domains, and if the boundary moves or has nodes
+    that belong to no shape.
     """
     metadata, boundary = truth.metadata, truth.boundary
     if any(metadata.periodic) or boundary.motion is not None or boundary.vel.any() or nodes_beside_shapes(boundary).any():
@@ -64,9 +67,34 @@ def mirrors(truth: Trajectory) -> list[Mirror]:
         same = same and np.allclose(truth.mass, truth.mass[partner], rtol=1e-3)
         same = same and np.allclose(truth.material_params, truth.material_params[partner], rtol=1e-3, equal_nan=True)
         with_partners = Mirror(axis, mirror.offset, partner)
+        same = same and _has_mirrored_bodies(truth, partner)
         if same and _has_mirrored_surroundings(truth, pos, with_partners) and _has_mirrored_loads(truth, with_partners):
             found.append(with_partners)
     return found
+
+
+def _has_mirrored_bodies(truth: Trajectory, partner: np.ndarray) -> bool:
+    """Tell whether the partners of a rigid body's or of a mesh's nodes are those of one body, too, and of a mesh with the same shape at rest."""
+    if truth.rigid_body is not None and not _are_mapped(truth.rigid_body, partner):
+        return False
+    if truth.cells is None:
+        return True
+    edges, label = cell_edges(truth.cells.astype(np.int64), truth.num_nodes), np.full(truth.num_nodes, -1)
+    for number, nodes in enumerate(bodies(truth.cells, truth.num_nodes)):
+        label[nodes] = number
+    if not _are_mapped(label, partner):
+        return False
+    if truth.rest_pos is None:
+        return True
+    rest = truth.rest_pos.astype(np.float64)
+    own, opposite = (np.linalg.norm(rest[start] - rest[end], axis=1) for start, end in (edges, partner[edges]))
+    return bool(np.abs(own - opposite).max(initial=0.0) <= CLOSE * truth.metadata.spacing)
+
+
+def _are_mapped(body: np.ndarray, partner: np.ndarray) -> bool:
+    """Tell whether all nodes of a body have partners in one body, whose number is another or the same. Nodes with −1 belong to none."""
+    pairs = np.unique(np.stack([body, body[partner]]), axis=1)
+    return len(pairs.T) == len(np.unique(body)) and bool(((pairs[0] < 0) == (pairs[1] < 0)).all())
 
 
 def _has_mirrored_surroundings(truth: Trajectory, pos: np.ndarray, mirror: Mirror) -> bool:

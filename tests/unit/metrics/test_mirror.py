@@ -116,6 +116,35 @@ def test_scenes_without_symmetry(change: Callable[[Trajectory], Trajectory]) -> 
     assert mirrors(change(beam())) == []
 
 
+def pair_of_triangles(stretch: float = 1.0, bodies: list[int] | None = None, turn: float = 0.0) -> Trajectory:
+    """Two triangles on both sides of x = 0.5, the right one of another size or direction at rest; or loose nodes and rigid bodies at their places."""
+    pos = np.array([[0.2, 0.5], [0.3, 0.5], [0.2, 0.6], [0.8, 0.5], [0.7, 0.5], [0.8, 0.6]])
+    frames, about = np.repeat(pos[None], 4, axis=0), {"bounds": [(0, 1)] * 2, "spacing": 0.1, "gravity": [0, -9.81]}
+    if bodies is not None:
+        return Trajectory.from_numpy(frames, DT, "sand", {"sand": 30.0}, rigid_body=bodies, **about)  # type: ignore[arg-type]
+    rest, cells = pos.copy(), np.array([[0, 1, 2], [3, 4, 5]])
+    turned = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    rest[3:] = (rest[3:] - rest[3]) / stretch @ turned + rest[3]
+    law = {"elastomer": {"youngs_modulus": 1e5, "poisson_ratio": 0.3}}
+    return Trajectory.from_numpy(frames, DT, "elastomer", law, cells=cells, rest_pos=rest, mass=1.0, **about)  # type: ignore[arg-type]
+
+
+def test_meshes_and_rigid_bodies_may_be_symmetric() -> None:
+    for scene in (pair_of_triangles(), pair_of_triangles(turn=0.7), pair_of_triangles(bodies=[7, 7, 7, 2, 2, 2])):
+        assert [mirror.axis for mirror in mirrors(scene)] == [0]
+
+
+@pytest.mark.parametrize("bodies", [[0, 0, 0, -1, -1, -1], [0, 0, 0, 1, 1, 2], [0, 0, 1, 1, 1, 1]])
+def test_rigid_bodies_on_one_side_leave_no_symmetry(bodies: list[int]) -> None:
+    assert mirrors(pair_of_triangles(bodies=bodies)) == []
+
+
+def test_meshes_of_another_rest_shape_or_on_one_side_leave_no_symmetry() -> None:
+    scene = pair_of_triangles()
+    assert mirrors(pair_of_triangles(stretch=2.0)) == []
+    assert mirrors(replace(scene, cells=scene.cells[:1])) == []  # type: ignore[index]
+
+
 def test_floors_of_equal_friction_on_both_sides_are_symmetric() -> None:
     boxes = (Box((0.0, 0.0), (0.4, 0.2), 0.3), Box((0.4, 0.0), (1.0, 0.2), 0.3))
     t = beam()
