@@ -64,7 +64,7 @@ class Calibration:
                 f"{len(self.scenes)} calibration scenes: bands with a level of {LEVEL:g} need at least {fewest}; choose more, such as data.num_test=40"
             )
         dataset, split, frame_dt, spacing = self.about
-        shortest = min(map(len, self.spreads), default=0)
+        num_frames = max(map(len, self.spreads), default=0)  # rollouts that stopped early leave the limits of later frames to the others
         return Bands(
             checkpoints=[checksum(checkpoint_path(path)) for path in checkpoints],
             dataset=dataset,
@@ -79,6 +79,6 @@ class Calibration:
             settings=self.settings,
             nodes=factors_of(self.scenes, "nodes"),
             scene=factors_of(self.scenes, "scene"),
-            spread=[rounded_up(max(own[frame] for own in self.spreads)) for frame in range(1, shortest)],
+            spread=[rounded_up(max(own[frame] for own in self.spreads if frame < len(own))) for frame in range(1, num_frames)],
             features={name: (float(f"{low:.6g}"), float(f"{high:.6g}")) for name, (low, high) in united(self.features).items()},
         )

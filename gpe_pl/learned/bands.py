@@ -71,7 +71,8 @@ class Bands:
         spacing: rest spacing of nodes [m]; None in earlier files.
         scenes: identities of the calibration scenes (see ``identity``); empty in earlier files.
         nodes, scene: factors of frames 1, 2, … by level; None where there are too few scenes, or too many rollouts failed.
-        spread: largest mean spread of an ensemble over the nodes of a calibration scene, in frames 1, 2, … [m]; empty for a single model.
+        spread: largest mean spread of an ensemble over the nodes of a calibration scene whose rollout reaches the frame, in frames 1, 2, … [m]; empty for a
+            single model.
         features: lowest and highest values of features in calibration scenes, by name (see ``unlike``).
     """
 
@@ -194,7 +195,9 @@ def of_nodes_in(truth: Trajectory, values: Float[np.ndarray, "some_frames some_n
     return np.pad(values, missing, constant_values=filling)
 
 
-def scores_of(prediction: Trajectory, truth: Trajectory, spread: Float[np.ndarray, "frame node"] | None) -> Float[np.ndarray, "frame node"]:
+def scores_of(
+    prediction: Trajectory, truth: Trajectory, spread: Float[np.ndarray, "some_frames some_nodes"] | None
+) -> Float[np.ndarray, "frame node"]:
     """Return errors over scales, for each frame of the ground truth and each node; NaN for nodes that do not count."""
     return errors_of(prediction, truth) / of_nodes_in(truth, scale_of(prediction, spread), 1.0)
 

@@ -60,6 +60,18 @@ def calibrated(num_scenes: int, checkpoint: Path, first: int = 0) -> Bands:
     return calibration.bands([checkpoint])
 
 
+def test_a_rollout_that_stops_early_keeps_the_limits_of_the_spread_from_others(checkpoint: Path) -> None:
+    calibration = Calibration("abc", True, 2)
+    for seed in range(19):
+        own = scene(seed)
+        spread = np.full((FRAMES, NODES), 0.001 * (1 + seed))
+        if seed == 18:  # the widest
+            own.predictions[LEARNED] = replace(own.predictions[LEARNED].frames(0, 2), termination=Termination("explosion", 2, 0, "x"))
+            spread = spread[:2]
+        calibration.add(replace(own, spread=spread))
+    assert calibration.bands([checkpoint, checkpoint]).spread == pytest.approx([0.019, 0.018, 0.018, 0.018])
+
+
 def of_frames(own: Bands) -> Bands:
     """Return bands for the frames and the spacing of ``tests.scenes``."""
     return replace(own, frame_dt=metadata().frame_dt, spacing=metadata().spacing)
