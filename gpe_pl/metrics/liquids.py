@@ -82,7 +82,7 @@ def liquid_metrics(
     space = metadata.periodicity
 
     def relative(own: Any, true: Any) -> float:
-        return float(abs(own - true) / true) if true else float("inf")
+        return float(abs(own - true) / true) if true else (float("inf") if own else 0.0)
 
     sizes = [np.median(nearest_distances(x, space)) for x in (pos, reference)]
     own, true = (np.sort(density(x, metadata)) for x in (pos, reference))

@@ -26,6 +26,12 @@ def test_exchanged_nodes_are_no_error() -> None:
     assert max(measured(POOL[order]).values()) < 1e-12
 
 
+def test_nodes_that_coincide_as_in_the_ground_truth_are_no_error() -> None:
+    pos = np.repeat(POOL[:1], 3, axis=0)
+    assert set(liquid_metrics(pos, pos, np.ones(3), METADATA).values()) == {0.0}
+    assert liquid_metrics(POOL[:3], pos, np.ones(3), METADATA)["spacing_error"] == np.inf
+
+
 def test_clusters_are_an_error_of_spacing_and_density_but_not_of_the_centre() -> None:
     clustered = POOL.copy()
     clustered[1::2, 0] -= 0.06  # pairs along each row
