@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import logging
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
@@ -27,7 +28,7 @@ from pydantic import TypeAdapter, ValidationError
 from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replacing
 from gpe_pl.files.hdf5_arrays import attribute, dataset_in, is_named, is_own, obstacle
-from gpe_pl.files.json_text import parsed
+from gpe_pl.files.json_text import MAX_DIGITS, parsed
 from gpe_pl.files.late_failure import LateFailure
 from gpe_pl.geometry.shape_values import shape_from_dict, shape_to_dict, shapes_fault
 from gpe_pl.geometry.shapes import Shape
@@ -37,6 +38,11 @@ from gpe_pl.trajectory.openings import Opening, openings_fault, openings_from_js
 from gpe_pl.trajectory.state import Stress
 from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
 from gpe_pl.trajectory.values import faults, size_conflicts
+
+log = logging.getLogger(__name__)
+
+ROUNDING_SPACINGS = 1e-3
+"""Rounding error of stored positions above which a warning is logged [spacings]. Accelerations are often a hundredth of a spacing per frame squared."""
 
 
 class StoreError(GpeError, ValueError):
@@ -69,7 +75,11 @@ class UnsoundError(StoreError):
 
 
 def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return the arrays of a trajectory with the names and types of ``schema.FIELDS``."""
+    """Return the arrays of a trajectory with the names and types of ``schema.FIELDS``.
+
+    Raises:
+        StoreError: an array of integers has a value that its type cannot hold; the message names field and value.
+    """
     b = trajectory.boundary
     arrays: dict[str, Any] = {
         "pos": trajectory.pos,
@@ -94,7 +104,16 @@ def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
         for part in ("node", "cell"):
             arrays[f"{part}_stress"] = getattr(trajectory.stress, part)
             arrays[f"{part}_von_mises"] = getattr(trajectory.stress, f"{part}_von_mises")
-    return {k: np.ascontiguousarray(v, dtype=FIELDS[k].dtype) for k, v in arrays.items() if v is not None}
+    return {key: _of_stored_type(key, np.asarray(values)) for key, values in arrays.items() if values is not None}
+
+
+def _of_stored_type(key: str, values: np.ndarray) -> np.ndarray:
+    stored = np.ascontiguousarray(values, dtype=FIELDS[key].dtype)
+    if stored.dtype.kind in "iu" and (wrong := stored != values).any():
+        raise StoreError(
+            f"field {key!r}: {values[wrong][0]} cannot be stored as {stored.dtype}; give whole numbers up to {np.iinfo(stored.dtype).max}"
+        )
+    return stored
 
 
 def _stored_prescribed(prescribed: np.ndarray | None) -> dict[str, np.ndarray]:
@@ -190,10 +209,12 @@ def write_shard(path: Path | str, trajectories: Iterable[Trajectory], names: Ite
 
     Raises:
         ValueError: there are fewer ``names`` than trajectories.
+        StoreError: a name, an integer, the seed or the start time could not be read again; the message names it.
         FullDiskError: there is no room for the file.
     """
     path = Path(path)
     name_of = iter(names) if names is not None else (f"{k:05d}" for k in range(10**9))
+    is_warned = False
     # track_times off and the libver pinned: equal content gives equal bytes
     with replacing(path) as part, LateFailure(part) as place:
         with h5py.File(place, "w", libver=("v110", "v110"), track_order=False) as file:
@@ -204,17 +225,44 @@ def write_shard(path: Path | str, trajectories: Iterable[Trajectory], names: Ite
                 name = next(name_of, None)
                 if name is None:
                     raise ValueError(f"{path}: {count} names for more than {count} trajectories")
-                _write_trajectory(file.create_group(name), trajectory)
+                _check_writable(path, name, trajectory)
+                is_warned = is_warned or _warn_of_rounding(f"{path}:{name}", trajectory)
+                try:
+                    arrays = stored_arrays(trajectory)
+                except StoreError as error:
+                    raise StoreError(f"{path}:{name}: {error}") from None
+                group = file.create_group(name)
+                fill_group(group, arrays, stored_attributes(trajectory))
+                if trajectory.is_prediction:
+                    _write_text(group, PREDICTION, "")
                 place.check()
                 count += 1
             file.attrs["num_trajectories"] = count
         place.check()
 
 
-def _write_trajectory(group: h5py.Group, trajectory: Trajectory) -> None:
-    fill_group(group, stored_arrays(trajectory), stored_attributes(trajectory))
-    if trajectory.is_prediction:
-        _write_text(group, PREDICTION, "")
+def _check_writable(path: Path, name: str, trajectory: Trajectory) -> None:
+    """Raise ``StoreError`` for a name, a seed or a start time that could not be read again."""
+    if name in ("", ".") or {"/", "\0"} & {*name}:
+        raise StoreError(f"{path}: {name!r} cannot name a trajectory; choose a name that is not empty, not '.', and without '/' and NUL")
+    if not math.isfinite(trajectory.start_time):
+        raise StoreError(f"{path}:{name}: start_time is {trajectory.start_time}; give a number of seconds")
+    if abs(trajectory.metadata.seed) >= 10**MAX_DIGITS:
+        raise StoreError(f"{path}:{name}: the seed in the metadata has more than {MAX_DIGITS} digits; choose a smaller one")
+
+
+def _warn_of_rounding(where: str, trajectory: Trajectory) -> bool:
+    """Warn if float32 rounds positions by more than ``ROUNDING_SPACINGS``. Return whether it does."""
+    if trajectory.pos.dtype == np.float32:
+        return False
+    lost = max((float(np.abs(frame - frame.astype(np.float32)).max(initial=0.0)) for frame in trajectory.pos), default=0.0)
+    if not lost > ROUNDING_SPACINGS * trajectory.metadata.spacing:
+        return False
+    log.warning(
+        "%s: positions are stored in float32, which rounds them by up to %.3g m so far from 0; the spacing is %.3g m. Move the origin nearer to the scene",
+        where, lost, trajectory.metadata.spacing,
+    )  # fmt: skip
+    return True
 
 
 def fill_group(group: h5py.Group, arrays: Mapping[str, np.ndarray], attributes: Mapping[str, str]) -> None:

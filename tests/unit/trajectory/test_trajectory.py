@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -157,6 +158,46 @@ def test_too_few_names(tmp_path: Path, trajectory: Trajectory) -> None:
     with pytest.raises(ValueError, match="1 names for more than 1 trajectories"):
         write_shard(tmp_path / "shard.h5", [trajectory, trajectory], names=["a"])
     assert not (tmp_path / "shard.h5").exists()
+
+
+@pytest.mark.parametrize("name", ["a/b", "00001\0x", "", "."])
+def test_names_that_hdf5_would_change_are_refused(tmp_path: Path, trajectory: Trajectory, name: str) -> None:
+    with pytest.raises(StoreError, match=r"shard\.h5: .* cannot name a trajectory; choose a name that is not empty"):
+        write_shard(tmp_path / "shard.h5", [trajectory], names=[name])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rigid_body": np.array([2**32 - 1] * 3 + [-1] * 9)}, "field 'rigid_body': 4294967295 cannot be stored as int32"),
+        ({"rigid_body": np.array([0.5] * 12)}, r"field 'rigid_body': 0\.5 cannot be stored as int32"),
+        ({"node_type": np.full(12, 256)}, "field 'node_type': 256 cannot be stored as uint8"),
+        ({"start_time": float("nan")}, "start_time is nan; give a number of seconds"),
+    ],
+)
+def test_values_that_would_be_read_as_others_are_refused(
+    tmp_path: Path, trajectory: Trajectory, change: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(StoreError, match=rf"shard\.h5:00000: {message}"):
+        write_shard(tmp_path / "shard.h5", [replace(trajectory, **change)])
+
+
+def test_a_seed_has_at_most_as_many_digits_as_are_read(tmp_path: Path, trajectory: Trajectory) -> None:
+    largest, larger = (replace(trajectory, metadata=replace(trajectory.metadata, seed=seed)) for seed in (10**20 - 1, 10**20))
+    write_shard(tmp_path / "shard.h5", [largest])
+    assert read_metadata(tmp_path / "shard.h5", "00000").seed == 10**20 - 1
+    with pytest.raises(StoreError, match=r"shard\.h5:00000: the seed in the metadata has more than 20 digits"):
+        write_shard(tmp_path / "shard.h5", [larger])
+
+
+def test_positions_that_float32_rounds_have_one_warning(tmp_path: Path, trajectory: Trajectory, caplog: pytest.LogCaptureFixture) -> None:
+    near = replace(trajectory, pos=trajectory.pos.astype(np.float64) + 1.0 / 3.0)
+    write_shard(tmp_path / "shard.h5", [near, replace(near, pos=near.pos.astype(np.float32) + np.float32(5e6))])
+    assert not caplog.messages
+    write_shard(tmp_path / "shard.h5", [near, *[replace(near, pos=near.pos + 5e6)] * 2])
+    (message,) = caplog.messages
+    assert "shard.h5:00001: positions are stored in float32, which rounds them by up to 0.2" in message
 
 
 def test_errors_name_the_file(shard: Path) -> None:
