@@ -81,9 +81,10 @@ def time_decimals(frame_dt: float) -> int:
     return max(0, len(digits.rstrip("0").partition(".")[2]) - int(exponent))
 
 
-def frame_time(frame: int, frame_dt: float) -> str:
-    """Return the time of a frame with as many decimals as the time between frames [s]: ``0.096 s``."""
-    return f"{frame * frame_dt:.{time_decimals(frame_dt)}f} s"
+def frame_time(frame: int, trajectory: Trajectory) -> str:
+    """Return the time of a frame since the start of the scene, with as many decimals as the time between frames: ``0.096 s``."""
+    frame_dt = trajectory.metadata.frame_dt
+    return f"{trajectory.start_time + frame * frame_dt:.{time_decimals(frame_dt)}f} s"
 
 
 def parameter_name(parameter: MaterialParameter) -> str:

@@ -102,7 +102,7 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
         figure.text(left / 2 / TEXT_WIDTH, y + h / 2, as_written(label), rotation=90, va="center", linespacing=1.1, **style)
     for j, frame in enumerate(frames):
         x, _, w, _ = rectangle(0, j)
-        text = ("" if j else "$t$ = ") + frame_time(frame, trajectories[0].metadata.frame_dt)
+        text = ("" if j else "$t$ = ") + frame_time(frame, trajectories[0])
         figure.text(x + w / 2, 1 - (top - 0.05) / height, text, va="bottom", **style)
     figure.text(0.5, below / height, as_written(caption), va="bottom", linespacing=1.1, **style)
     if has_bar:

@@ -153,9 +153,7 @@ class Panel:
             return
         self._show(np.full(self.trajectory.pos.shape[1:], np.nan), *self.coloring(self.trajectory, 0))
         stop = self.trajectory.termination
-        reason = (
-            "not simulated" if stop is None else f"stopped at {frame_time(stop.frame, self.trajectory.metadata.frame_dt)}\n({stop.reason})"
-        )
+        reason = "not simulated" if stop is None else f"stopped at {frame_time(stop.frame, self.trajectory)}\n({stop.reason})"
         if self._fit(reason) > self._height + 2 * self._above:
             self._fit(reason.replace("\n", " "))
         self.note.set(y=0.5, va="center")

@@ -145,7 +145,7 @@ def _images(rows: dict[str, Trajectory], frames: Sequence[int], coloring: Colori
         canvas.restore_region(background)
         for panel in panels:
             panel.show_frame(frame)
-        clock.set_text(frame_time(frame, first.metadata.frame_dt))
+        clock.set_text(frame_time(frame, first))
         for artist in moving:
             figure.draw_artist(artist)
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -255,7 +255,7 @@ def shown(candidate: Candidate, trials: Sequence[Trial], *fractions: float) -> l
     for trial in trials:
         for fraction in fractions:
             frame = round(fraction * (trial.truth.num_frames - 1))
-            time = frame_time(frame, trial.truth.metadata.frame_dt)
+            time = frame_time(frame, trial.truth)
             columns.append(Shown(f"{candidate.described(trial.value)}\n{time}", trial.truth, trial.model, frame))
     return columns
 

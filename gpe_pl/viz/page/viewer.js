@@ -228,7 +228,7 @@ class Viewer {
       panel.note.textContent = pos ? panel.of.notes[this.frame] : "";
     });
     $("frame").value = this.frame;
-    $("time").textContent = `${(this.frame * scene.frameInterval).toFixed(scene.decimals)} s   frame ${this.frame * scene.stride}`;
+    $("time").textContent = `${(scene.startTime + this.frame * scene.frameInterval).toFixed(scene.decimals)} s   frame ${this.frame * scene.stride}`;
     this.#markCurve();
     this.#point();
     this.drawMilliseconds = performance.now() - started; // time of this thread; the graphics card may take longer

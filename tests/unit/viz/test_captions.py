@@ -15,7 +15,7 @@ from gpe_pl.rollout.baselines import Ballistic
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.trajectory.store import read_trajectory, write_shard
-from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Termination, Trajectory
 from gpe_pl.viz import contact_sheet as sheets
 from gpe_pl.viz import video
 from gpe_pl.viz.camera import Camera
@@ -177,7 +177,22 @@ def test_a_distance_between_predictions_is_no_error() -> None:
     ],
 )
 def test_times_are_as_exact_as_the_time_between_frames(frame, frame_dt, expected):
-    assert frame_time(frame, frame_dt) == expected
+    t = truth()
+    assert frame_time(frame, replace(t, metadata=replace(t.metadata, frame_dt=frame_dt))) == expected
+
+
+def test_times_count_from_the_start_of_the_scene(tmp_path: Path) -> None:
+    t, p = truth(), predicted()
+    pairs = (t, p), (t.frames(3), p.frames(3))
+    whole, cut = ([text for text in texts(rollout_figure(own, {"m": other})) if text.endswith(" s")] for own, other in pairs)
+    dt = t.metadata.frame_dt
+    assert whole[0] == f"$t$ = {frame_time(0, t)}" and whole[-1] == cut[-1]
+    assert cut[0] == f"$t$ = {frame_time(3, t)}"
+    stopped = replace(p.frames(3, 5), termination=Termination("explosion", 2, 0, "x"))
+    write_viewer(tmp_path / "a.html", t.frames(3), {"m": stopped})
+    scene = json.loads(re.search(r'id="scene"[^>]*>(.*?)</script>', (tmp_path / "a.html").read_text(encoding="utf-8"), re.S)[1])  # type: ignore[index]
+    assert scene["startTime"] == pytest.approx(3 * dt)
+    assert scene["trajectories"][1]["stopped"] == f"stopped at {frame_time(5, t)} (explosion)"
 
 
 @pytest.mark.parametrize(("place", "is_told"), [(1.0 + 0.4, False), (1.0 + 0.7, True), (-0.7, True)])
