@@ -27,6 +27,9 @@ EVALUATIONS_MD = "table.md"
 NOT_IN_LABELS = ("data", "split", "graph.history", "evaluation.material_controls", "evaluation.num_pictures")
 """Prefixes of configuration keys that labels leave out, except that of the stride, at which a model of several scales may be evaluated."""
 STRIDE = "data.stride"
+CHECKPOINT = "checkpoint"
+OF_MODEL = "model."
+"""Prefix of settings that belong to the checkpoint."""
 
 Labelled = dict[tuple[str, str], dict[str, Run]]
 """Evaluations by domain and split, then by label."""
@@ -47,7 +50,8 @@ def report_evaluations(folder: Path, runs: Sequence[Run]) -> None:
 def labelled(runs: Sequence[Run]) -> Labelled:
     """Return evaluations by domain and split, then by label.
 
-    A label names the settings in which the evaluations of a domain differ, or the checkpoint if they differ in none.
+    A label names the checkpoint, and the settings in which the evaluations of a domain differ. Settings of models are left out if their checkpoints differ,
+    and the checkpoint is left out if all have the same one and differ in settings.
 
     Raises:
         RunError: evaluations of one split are of different data.
@@ -56,9 +60,12 @@ def labelled(runs: Sequence[Run]) -> Labelled:
     for domain in dict.fromkeys(str(run.config["data.name"]) for run in runs):
         own = [run for run in runs if run.config["data.name"] == domain]
         axes = [axis for axis in axes_of(own) if axis == STRIDE or not axis.startswith(NOT_IN_LABELS)]
+        checkpoints = _names_of_checkpoints(own)
+        if CHECKPOINT in axes:
+            axes = [axis for axis in axes if axis != CHECKPOINT and not axis.startswith(OF_MODEL)]
         for run in own:
-            values = {axis.rpartition(".")[2]: run.config.get(axis) for axis in axes}
-            label = ", ".join(f"{name}={value}" for name, value in values.items()) or str(run.config["checkpoint"]).partition(".ckpt")[0]
+            values = [f"{axis.rpartition('.')[2]}={run.config.get(axis)}" for axis in axes]
+            label = ", ".join([checkpoints[str(run.config[CHECKPOINT])], *values] if len(checkpoints) > 1 or not values else values)
             group = groups.setdefault((domain, str(run.config["split"])), {})
             _check_data(run, [*group.values()])
             if (before := group.get(label)) is not None:
@@ -68,6 +75,13 @@ def labelled(runs: Sequence[Run]) -> Labelled:
             else:
                 group[label] = run
     return groups
+
+
+def _names_of_checkpoints(runs: Sequence[Run]) -> dict[str, str]:
+    """Return names of checkpoints: those of their files, or with the checksums if different ones have the same name."""
+    checkpoints = {str(run.config[CHECKPOINT]) for run in runs}
+    names = {checkpoint: checkpoint.partition(".ckpt")[0] for checkpoint in checkpoints}
+    return names if len({*names.values()}) == len(names) else {checkpoint: checkpoint for checkpoint in checkpoints}
 
 
 def _check_data(run: Run, others: list[Run]) -> None:

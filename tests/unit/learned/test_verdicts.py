@@ -53,10 +53,12 @@ def test_a_card_begins_with_the_latest_failures(checkpoint: Path, tmp_path: Path
         judged(results)
         title, first, *rest = card.read_text().split("\n\n")
         assert title == "# model" and first.startswith(f"**{line}")
+        assert ("what was tried" in first) == line.startswith("Fails")
         assert rest == ["GPE for sand.", "Trained for long.\n"]
     write(results / "model.stability.json", Verdict(checksum(checkpoint), [GOOD, SHAKY]))
     judged(results)
-    assert card.read_text().split("\n\n")[1] == "**Passes acceptance: 1 of 1 checks. Fails 1 of 2 stress tests: 22 a pile at rest.**"
+    first = card.read_text().split("\n\n")[1]
+    assert first.startswith("**Passes acceptance: 1 of 1 checks. Fails 1 of 2 stress tests: 22 a pile at rest.** The guide")
     checkpoint.write_bytes(b"other weights")
     with pytest.raises(ValueError, match="of another checkpoint"):
         judged(results)

@@ -129,6 +129,36 @@ def test_evaluations_of_a_model_at_two_strides_are_two(tmp_path: Path) -> None:
     assert list(group) == ["stride=1", "stride=2"]
 
 
+def change(folder: Path, **changes: object) -> None:
+    path = folder / "config.json"
+    config = json.loads(path.read_text())
+    del config["sha256"]
+    sealed.write(path, config | changes)
+
+
+@pytest.mark.parametrize(
+    ("checkpoints", "labels"),
+    [
+        (("affine.ckpt (sha256 01)", "none.ckpt (sha256 23)"), ["affine", "none"]),
+        (("best.ckpt (sha256 01)", "best.ckpt (sha256 23)"), ["best.ckpt (sha256 01)", "best.ckpt (sha256 23)"]),
+    ],
+)
+def test_checkpoints_have_their_names_unless_these_are_alike(tmp_path: Path, checkpoints: tuple[str, str], labels: list[str]) -> None:
+    for name, checkpoint in zip("ab", checkpoints, strict=True):
+        write_evaluation(tmp_path / name, "sand", 1.0)
+        change(tmp_path / name, checkpoint=checkpoint, model={"material_embedding": name})  # belongs to the checkpoint
+    (group,) = labelled(evaluations_below(tmp_path)).values()
+    assert [*group] == labels
+
+
+def test_settings_follow_the_name_of_the_checkpoint(tmp_path: Path) -> None:
+    for name, friction in (("a", None), ("b", 0.2), ("c", 0.2)):
+        write_evaluation(tmp_path / name, "sand", 1.0, friction)
+    change(tmp_path / "c", checkpoint="other.ckpt (sha256 45)")
+    (group,) = labelled(evaluations_below(tmp_path)).values()
+    assert [*group] == ["sand, static_friction=None", "sand, static_friction=0.2", "other, static_friction=0.2"]
+
+
 def test_training_runs_and_evaluations_are_told_apart(tmp_path: Path) -> None:
     write_evaluation(tmp_path / "sand", "sand", 1.0)
     assert not finished_runs(tmp_path) and [run.folder.name for run in evaluations_below(tmp_path)] == ["sand"]
