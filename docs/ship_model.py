@@ -125,7 +125,7 @@ def _bodies(rows: list[Row]) -> str:
 def _opening(name: str, headline: str) -> list[str]:
     """The first lines of a card: what fails, and where the guide says what was tried against it."""
     said = f"**{headline[0].upper()}{headline[1:].replace('|', '/').replace('*', '')}.**"
-    return [f"# {name}", "", f"{said} {TRIED}" if "ails " in headline else said, ""]
+    return [f"# {name}", "", f"{said}\n{TRIED}" if "ails " in headline else said, ""]
 
 
 def shipped(run: Path, name: str, commit: str, command: str, *evaluations: str) -> None:

@@ -58,7 +58,7 @@ def test_a_card_begins_with_the_latest_failures(checkpoint: Path, tmp_path: Path
     write(results / "model.stability.json", Verdict(checksum(checkpoint), [GOOD, SHAKY]))
     judged(results)
     first = card.read_text().split("\n\n")[1]
-    assert first.startswith("**Passes acceptance: 1 of 1 checks. Fails 1 of 2 stress tests: 22 a pile at rest.** The guide")
+    assert first.startswith("**Passes acceptance: 1 of 1 checks. Fails 1 of 2 stress tests: 22 a pile at rest.**\nThe guide")
     checkpoint.write_bytes(b"other weights")
     with pytest.raises(ValueError, match="of another checkpoint"):
         judged(results)
