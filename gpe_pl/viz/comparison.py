@@ -94,7 +94,7 @@ def parameter_figure(
     panels = grid.flat[: len(curves)]
     for axes in grid.flat[len(curves) :]:
         axes.remove()
-    models = list(dict.fromkeys(m for domain in curves.values() for m in domain))
+    models = sorted(dict.fromkeys(m for domain in curves.values() for m in domain), key=lambda m: m in references)  # which have no colours
     styles = curve_styles(len(models))
     for axes, (domain, by_model) in zip(panels, curves.items(), strict=True):
         given = [p for points in by_model.values() for p in points]
