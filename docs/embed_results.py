@@ -129,10 +129,15 @@ def draw(name: str, figure: str) -> None:
         with recorded(Path(folder), "docs/embed_results.py", ["--draw", name, figure], folder):
             write_tables(Path(folder), finished_runs(target))
         picture(Path(folder, figure), target / figure)
-        session = sessions(Path(folder))
+        add_session(target, Path(folder))
+
+
+def add_session(target: Path, drawn: Path) -> None:
+    """Add the session that drew a figure to those of a folder of results. An earlier one of the same command is replaced."""
+    (session,) = sessions(drawn)
     before = sealed.read(target / PROVENANCE, ADVICE)
-    earlier = [found for found in before["sessions"] if found["command"] != session[0]["command"]]
-    sealed.write(target / PROVENANCE, {**before, "sessions": [*earlier, *session]})
+    earlier = [found for found in before["sessions"] if found["command"] != session["command"]]
+    sealed.write(target / PROVENANCE, {**before, "sessions": [*earlier, session]})
 
 
 def renewed(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:

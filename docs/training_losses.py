@@ -16,12 +16,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from embed_results import RESULTS, picture
+from embed_results import RESULTS, add_session, picture
 
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
-from gpe_pl.system.provenance import ADVICE, PROVENANCE, recorded, sessions
+from gpe_pl.system.provenance import PROVENANCE, recorded, sessions
 from gpe_pl.viz.figures import validation_loss_figure
 from gpe_pl.viz.saving import save_figure
 
@@ -105,10 +105,7 @@ def draw(name: str) -> None:
             shutil.copy(target / "losses.csv", folder)
             figure(Path(folder))
         shutil.copy(Path(folder, "validation_loss.png"), target)
-        (session,) = sessions(Path(folder))
-    before = sealed.read(target / PROVENANCE, ADVICE)
-    earlier = [found for found in before["sessions"] if found["command"] != session["command"]]
-    sealed.write(target / PROVENANCE, {**before, "sessions": [*earlier, session]})
+        add_session(target, Path(folder))
 
 
 if __name__ == "__main__":
