@@ -97,7 +97,8 @@ class SplitFiles:
                 for name, quantity in of_truth.items()
                 for own in [of_prediction.get(name)]
             }
-            figure = courses_figure(courses, truth.metadata.frame_dt, f"{self.split} {about[1]}: {describe(truth)}")
+            title = f"{self.split} {about[1]}: {describe(truth)}"
+            figure = courses_figure(courses, truth.start_time, truth.metadata.frame_dt, title)
             save(figure, self.run_dir / f"quantities_{self.split}_{about[1]:02d}.png", self.settings.export)
 
     def _draw_quantities(self) -> None:

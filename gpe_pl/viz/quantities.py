@@ -26,11 +26,12 @@ Numbers = tuple[str, list[tuple[float, float, float]]]
 values or none, and a prediction where the rollout stopped early."""
 
 
-def courses_figure(courses: Mapping[str, Course], frame_dt: float, title: str) -> Figure:
+def courses_figure(courses: Mapping[str, Course], start_time: float, frame_dt: float, title: str) -> Figure:
     """Draw quantities of one scene against time, a panel each.
 
     Args:
         courses: quantities by name.
+        start_time: time of frame 0 in the scene [s].
         frame_dt: time between frames [s].
         title: heading of the figure, with the material parameters.
     """
@@ -41,7 +42,7 @@ def courses_figure(courses: Mapping[str, Course], frame_dt: float, title: str) -
     for axes, (name, (unit, values)) in zip(panels, courses.items(), strict=False):
         for k, (who, course) in enumerate(values.items()):
             style = {"color": "0.2", "linewidth": 1.6} if k == 0 else {"color": PALETTE[k], "linewidth": 1.2, "linestyle": "--"}
-            axes.plot(frame_dt * np.arange(1, len(course) + 1), course, label=who, **style)
+            axes.plot(start_time + frame_dt * np.arange(1, len(course) + 1), course, label=who, **style)
         _labelled(axes, "time [s]", f"{name} [{unit}]")
     for axes in panels[len(courses) :]:
         axes.set_axis_off()

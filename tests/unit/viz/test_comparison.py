@@ -11,7 +11,7 @@ from gpe_pl.metrics import Interval
 from gpe_pl.viz.coloring import REFERENCE
 from gpe_pl.viz.comparison import CostAndError, comparison_figure, cost_error_figure, parameter_figure
 from gpe_pl.viz.coverage import CoverageCurves, coverage_figure
-from gpe_pl.viz.quantities import parity_figure
+from gpe_pl.viz.quantities import courses_figure, parity_figure
 
 NEVER = float("inf")
 
@@ -89,6 +89,14 @@ def test_every_level_of_costs_and_errors_has_its_line() -> None:
     flat = {str(line.get_label()): (line.get_linestyle(), line.get_ydata()[0]) for line in axes.lines}
     assert [flat[name][1] for name in levels] == [3.0, 2.0, 1.0] and len({flat[name][0] for name in levels}) == 3
     assert r"\$a_b\$ model" in flat, "not as mathematics"
+
+
+def test_courses_are_drawn_over_the_time_in_the_scene() -> None:
+    energy = np.array([3.0, 2.0, 1.0])
+    figure = courses_figure({"energy": ("J", {"ground truth": energy, "learned": energy[:2]})}, 0.25, 0.1, "begins at 0.25 s")
+    truth, learned = figure.axes[0].lines
+    np.testing.assert_allclose(np.asarray(truth.get_xdata(), float), [0.35, 0.45, 0.55])
+    np.testing.assert_allclose(np.asarray(learned.get_xdata(), float), [0.35, 0.45])
 
 
 def test_colours_of_a_parity_figure_have_one_scale() -> None:
