@@ -245,6 +245,12 @@ def boundary_features(config: GraphConfig, boundary: Boundary, scales: Scales) -
     return torch.cat([velocity, boundary.normal, torch.stack([friction, boundary.restitution], dim=1)], dim=1)
 
 
+def boundary_values(x: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return velocities in features' units, normals and friction coefficients from what ``boundary_features`` returns with ``boundary_condition``."""
+    velocity, normal, friction = x[:, :dim], x[:, dim : 2 * dim], x[:, 2 * dim].double()
+    return velocity, normal, friction / (1 - friction)
+
+
 def edge_features(
     features: Features,
     displacement: Float64[Tensor, "edge dim"],

@@ -6,7 +6,7 @@ most of the time of a PyTorch operation is its overhead.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import no_type_check
 
@@ -17,10 +17,11 @@ from torch import Tensor
 from torch_geometric.data import HeteroData
 
 from gpe_pl.graphs.compiled_graph import works_on
+from gpe_pl.graphs.features import boundary_values
 from gpe_pl.graphs.topology import Topology
-from gpe_pl.nn.static_friction import pushed, supported
+from gpe_pl.nn.static_friction import Contacts, bears, pushed, supported
 from gpe_pl.nn.stores import contents
-from gpe_pl.schema import BOUNDARY
+from gpe_pl.schema import BOUNDARY, FeatureSpec
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.rigid_bodies import moved_rigidly
@@ -71,19 +72,42 @@ def keep_slow(state: State, new: State, topology: Topology, fraction: float, dt:
         dt: frame interval [s].
     """
     assert topology.islands is not None
-    label, is_free = topology.islands.label, topology.islands.is_free
-    if state.openings or state.loads is not None:  # islands that these alone touch are not free, but nothing supports them
-        walls = [(label[topology.rows[r[2]]][own[1]], torch.zeros(own.shape[1])) for r, own in topology.edges.items() if r[0] == BOUNDARY]
-        is_free = ~supported(is_free, [*walls, *pushed(state, label, dt)])
+    label = topology.islands.label
+    is_held = supported(topology.islands.is_free, [*_walls_at_rest(state, topology, label), *pushed(state, label, dt)])
     given = None if state.loads is None else (new.pos.clone(), new.vel.clone())
     history = new.vel[:, None] if new.velocity_history is None else new.velocity_history
     at_frame = new.vel if new.frame_velocity is None else new.frame_velocity
-    before = (state.pos.numpy(), state.vel.numpy(), label.numpy(), is_free.numpy())
+    before = (state.pos.numpy(), state.vel.numpy(), label.numpy(), is_held.numpy())
     _keep_slow(*before, state.gravity.numpy(), fraction * dt, new.pos.numpy(), new.vel.numpy(), history.numpy(), at_frame.numpy())
     if state.loads is not None and given is not None:  # static friction does not stop nodes whose motion is given
         held = torch.from_numpy(state.loads.prescribed)
         for values, moved_as_given in ((new.pos, given[0]), (new.vel, given[1]), (history[:, -1], given[1]), (at_frame, given[1])):
             values[held] = moved_as_given[held]
+
+
+def _walls_at_rest(state: State, topology: Topology, label: Tensor) -> Iterator[Contacts]:
+    """Yield the contacts of islands with walls, given the island of each node."""
+    boundary = state.boundary
+    can_bear = bears(torch.as_tensor(boundary.normal), torch.as_tensor(boundary.friction), state.gravity)
+    can_bear = can_bear if topology.boundary_rows is None else can_bear[topology.boundary_rows]
+    for relation, (j, i) in topology.edges.items():
+        if relation[0] == BOUNDARY:
+            yield label[topology.rows[relation[2]]][i], torch.zeros_like(j, dtype=torch.bool), can_bear[j]
+
+
+def supported_in(graph: HeteroData, spec: FeatureSpec, gravity: Tensor, others: Iterable[Contacts]) -> Tensor:
+    """Return a mask [island] of the islands of a scene's graph that static friction may keep in place.
+
+    Args:
+        graph: graph whose features are not standardised, and whose boundary nodes have a boundary condition.
+        spec: channels of the graph.
+        gravity: acceleration by gravity [dim] in m/s².
+        others: contacts besides walls.
+    """
+    vel, normal, friction = boundary_values(graph[BOUNDARY].x, spec.dim)
+    moves, can_bear = (vel != 0).any(dim=1), bears(normal, friction, gravity)
+    edges = [(graph[relation].edge_index, graph[relation[2]].island) for relation in spec.relations if relation[0] == BOUNDARY]
+    return supported(graph.island_is_free, [*others, *((island[i], moves[j], can_bear[j]) for (j, i), island in edges)])
 
 
 def advanced(state: State, acc: Tensor, dt: float) -> State:
@@ -161,14 +185,14 @@ def per_scene(predicted: dict[str, Tensor], rows: Sequence[Rows]) -> Iterator[tu
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def _keep_slow(old_pos, old_vel, island, is_free, gravity, duration, pos, vel, history, at_frame):
+def _keep_slow(old_pos, old_vel, island, is_held, gravity, duration, pos, vel, history, at_frame):
     speed = duration * np.sqrt((gravity * gravity).sum())
     for n in range(pos.shape[0]):
         before, after = 0.0, 0.0
         for a in range(pos.shape[1]):
             before += old_vel[n, a] ** 2
             after += vel[n, a] ** 2
-        if is_free[island[n]] or not (before < speed**2 and after < speed**2):
+        if not (is_held[island[n]] and before < speed**2 and after < speed**2):
             continue
         for a in range(pos.shape[1]):
             pos[n, a] = old_pos[n, a]

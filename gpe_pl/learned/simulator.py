@@ -45,7 +45,7 @@ from gpe_pl.learned.transfer import Transfer
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
 from gpe_pl.nn.node_loads import scaled
-from gpe_pl.nn.static_friction import keeps_position, pushed, supported
+from gpe_pl.nn.static_friction import keeps_position, pushed
 from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.rollout.loop import SimulationError, sound
 from gpe_pl.rollout.skips import Skips
@@ -191,6 +191,8 @@ class LearnedSimulator(nn.Module):
             raise ValueError(f"static_friction={fraction!r}: must be a number from 0 to less than 1, a fraction of gravity")
         if fraction and not self.builder.spec.islands:
             raise SceneError(f"static_friction={fraction:g}: needs a model that was trained with graph.islands=true; 0 turns it off")
+        if fraction and not self.builder.config.boundary_condition:  # graphs do not say which walls are below
+            raise SceneError(f"static_friction={fraction:g}: needs a model that was trained with graph.boundary_condition=true; 0 turns it off")
         self._static_friction = float(fraction)
 
     @property
@@ -495,7 +497,7 @@ class LearnedSimulator(nn.Module):
         island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
-        is_supported = self.supported(graph, pushed(state, island, self.builder.metadata.frame_dt))
+        is_supported = next_states.supported_in(graph, self.builder.spec, state.gravity, pushed(state, island, self.builder.metadata.frame_dt))
         stays = keeps_position(state.vel, new.vel, island, is_supported, self.slowest(state.gravity))
         stays = all_of_bodies(stays, state.rigid_body)[:, None]
         new = new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))
@@ -504,15 +506,6 @@ class LearnedSimulator(nn.Module):
     def slowest(self, gravity: Tensor) -> Tensor:
         """Return the speed [m/s] below which static friction keeps nodes in place."""
         return self.static_friction * self.builder.metadata.frame_dt * gravity.norm()
-
-    def supported(self, graph: HeteroData, others: Iterable[tuple[Tensor, Tensor]] = ()) -> Tensor:
-        """Return a mask [island] of the islands that static friction may keep in place, given contacts besides walls. Features must not be standardised."""
-        spec = self.builder.spec
-        vel = graph[BOUNDARY].x[:, : spec.dim]
-        moves = (vel != 0).any(dim=1)
-        walls = [relation for relation in spec.relations if relation[0] == BOUNDARY]
-        edges = [(graph[relation].edge_index, graph[relation[2]].island) for relation in walls]
-        return supported(graph.island_is_free, [*others, *((island[i], moves[j]) for (j, i), island in edges)])
 
     def advance(self, state: State, acc: Tensor) -> State:
         """Return the next state under an acceleration [node, dim] in m/s² that includes gravity, without static friction. Rigid bodies keep their shape."""

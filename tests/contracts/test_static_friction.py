@@ -19,8 +19,9 @@ from gpe_pl.learned.differentiable import Differentiable
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator, SceneError
 from gpe_pl.models.base import Prediction
 from gpe_pl.models.gpe import GPE
-from gpe_pl.nn.static_friction import supported
+from gpe_pl.nn.static_friction import bears, supported
 from gpe_pl.rollout.loop import rollout
+from gpe_pl.schema import STICKY
 from gpe_pl.system.compiled import unfused
 from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.openings import Opening
@@ -194,14 +195,51 @@ def test_what_moves_from_outside_holds_nothing(kind: str, is_compiled: bool) -> 
                 assert (found[~chosen] == ~holds[~chosen]).all(), (of_island, speed)
 
 
-def test_islands_that_touch_walls_none_of_which_moves() -> None:
-    is_free = torch.tensor([False, False, True, False])
+def test_islands_that_touch_walls_none_of_which_moves_and_one_of_which_bears() -> None:
+    is_free = torch.tensor([False, False, True, False, False, False])
+    none = torch.empty(0, dtype=torch.bool)
     contacts = [
-        (torch.tensor([0, 1, 1]), torch.tensor([False, False, True])),
-        (torch.tensor([3]), torch.tensor([False])),
-        (torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.bool)),
+        (torch.tensor([0, 1, 1]), torch.tensor([False, False, True]), torch.tensor([True, True, False])),
+        (torch.tensor([3, 4, 5, 5]), torch.tensor([False] * 4), torch.tensor([True, False, False, True])),
+        (torch.empty(0, dtype=torch.int64), none, none),
     ]
-    assert supported(is_free, contacts).tolist() == [True, False, False, True]
+    assert supported(is_free, contacts).tolist() == [True, False, False, True, False, True]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_wall_bears_up_to_its_angle_of_friction(dim: int) -> None:
+    gravity = 9.81 * torch.tensor([0.6, 0.0, -0.8] if dim == 3 else [0.6, -0.8], dtype=torch.float64)
+    up = -gravity / gravity.norm()
+    across = torch.tensor([0.8, 0.0, 0.6] if dim == 3 else [0.8, 0.6], dtype=torch.float64)
+    slopes = torch.deg2rad(torch.tensor([0.0, 21.0, 23.0, 44.0, 46.0, 89.0, 90.0, 120.0, 180.0], dtype=torch.float64))
+    normal = (slopes.cos()[:, None] * up + slopes.sin()[:, None] * across).float()
+    for friction, steepest in ((0.0, 0.0), (0.4, 21.0), (1.0, 44.0), (STICKY, 89.0)):
+        found = bears(normal, torch.full((9,), friction), gravity)
+        assert found.tolist() == [bool(slope <= np.deg2rad(steepest) + 1e-9) for slope in slopes], friction
+    assert not bears(normal, torch.full((9,), STICKY), torch.zeros(dim)).any()
+
+
+@pytest.mark.parametrize("is_compiled", [True, False])
+def test_ceilings_and_steep_walls_hold_nothing(is_compiled: bool) -> None:
+    """Nodes on the floor stay. With turned normals, it is a ceiling, a side wall or a slope, which holds them if its friction suffices."""
+    state, lies = lying_and_flying()
+    learned = simulator()
+    learned.static_friction = ENOUGH
+    with nullcontext() if is_compiled else unfused():
+        for turned, friction, holds in ((180, STICKY, False), (90, STICKY, False), (40, 0.5, False), (40, 1.0, True), (0, 0.0, True)):
+            angle = np.deg2rad(turned)
+            normal = np.tile([np.sin(angle), np.cos(angle)], (len(state.boundary.pos), 1))
+            boundary = replace(state.boundary, normal=normal, friction=np.full(len(normal), friction))
+            now = replace(state, boundary=boundary).to_torch()
+            stays = (learned.step(now).pos == now.pos).all(dim=1).numpy()
+            assert (stays == (lies & holds)).all(), (turned, friction)
+
+
+def test_a_graph_without_normals_has_none() -> None:
+    build = scenes.builder(("sand",), islands=True, boundary_condition=False)
+    made = LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=8), build)
+    with pytest.raises(SceneError, match="needs a model that was trained with graph.boundary_condition=true"):
+        made.static_friction = ENOUGH
 
 
 def test_a_model_that_does_not_know_its_islands_has_none() -> None:

@@ -128,6 +128,19 @@ def test_every_step_of_a_rollout_equals_that_of_the_simulator(simulator: Learned
 
 
 @pytest.mark.slow
+def test_static_friction_holds_what_lies_and_not_what_leans(simulator: LearnedSimulator) -> None:
+    simulator = simulator.on(simulator.builder.metadata)
+    simulator.static_friction = 0.99
+    spacing, state = simulator.builder.metadata.spacing, scene(simulator, (FLOOR, SIDE))
+    pos = np.concatenate([block((0.3, 0.5 * spacing), 7, spacing, 0), block((0.5 * spacing, 0.4), 5, spacing, 1), [[0.7, 0.7]]])
+    at_rest = simulator.standing(replace(state, pos=pos, vel=np.zeros_like(pos), velocity_history=None), simulator.builder.metadata)
+    (after,) = in_python(simulator, at_rest, 1)
+    stays = (after.pos.numpy() == pos).all(axis=1)
+    assert stays[:49].any() and not stays[49:].any()
+    assert np.abs(in_javascript(simulator, [at_rest], 1)["pos"][0] - after.pos.numpy()).max() < 1e-7
+
+
+@pytest.mark.slow
 def test_a_rollout_differs_as_much_as_rounding_makes_it(simulator: LearnedSimulator) -> None:
     state = scene(simulator, (FLOOR, SIDE, *OBSTACLES["solids"]))
     exact = in_python(simulator, state, 50)[-1].pos.numpy()

@@ -57,8 +57,17 @@ class List {
   }
 }
 
-/** Connected groups of nodes, and whether each has an edge to the boundary. */
-function islandsOf(count, pairs, walls) {
+/** Boundary nodes on which something can rest: their slope is at most the angle of friction. */
+function bearing(boundary, model) {
+  const [x, y] = model.gravity, level = (1 - model.level) * Math.hypot(x, y);
+  return Uint8Array.from({ length: boundary.count }, (_, b) => {
+    const along = -(boundary.normal[2 * b] * x + boundary.normal[2 * b + 1] * y);
+    return along > level / Math.sqrt(1 + boundary.friction[b] ** 2) ? 1 : 0;
+  });
+}
+
+/** Connected groups of nodes, whether each has an edge to the boundary, and whether one to a boundary node on which it can rest. */
+function islandsOf(count, pairs, walls, bears) {
   const parent = Int32Array.from({ length: count }, (_, n) => n);
   const root = (n) => {
     while (parent[n] !== n) n = parent[n] = parent[parent[n]];
@@ -71,9 +80,12 @@ function islandsOf(count, pairs, walls) {
   const label = new Int32Array(count);
   let number = 0;
   for (let n = 0; n < count; n++) label[n] = parent[n] === n ? number++ : label[root(n)];
-  const touches = new Uint8Array(number);
-  for (let e = 1; e < walls.length; e += 2) touches[label[walls.values[e]]] = 1;
-  return { label, number, touches };
+  const touches = new Uint8Array(number), rests = new Uint8Array(number);
+  for (let e = 1; e < walls.length; e += 2) {
+    touches[label[walls.values[e]]] = 1;
+    if (bears[walls.values[e - 1]]) rests[label[walls.values[e]]] = 1;
+  }
+  return { label, number, touches, rests };
 }
 
 /** Remove the part of accelerations that changes the momentum of islands in free flight; with ``angular`` also their angular momentum. */
@@ -127,7 +139,7 @@ export class Simulator {
     for (let n = 0; n < count; n++) {
       for (let a = 0; a < 2; a++) acc[2 * n + a] = values[decoded[0].at / 4 + n * decoded[0].columns + a];
     }
-    const islands = islandsOf(count, pairs, walls);
+    const islands = islandsOf(count, pairs, walls, bearing(boundary, model));
     if (model.islandMomentum !== "ignored") conserve(acc, state, islands, model.islandMomentum === "angular");
     this.integrate(state, acc, islands, held);
     const corrected = contain(shapes, state, model.frameDt);
@@ -213,7 +225,7 @@ export class Simulator {
     for (let n = 0; n < state.count; n++) {
       const vx = vel[2 * n] + (model.gravity[0] + acc[2 * n] * unit) * dt, vy = vel[2 * n + 1] + (model.gravity[1] + acc[2 * n + 1] * unit) * dt;
       const wasSlow = vel[2 * n] ** 2 + vel[2 * n + 1] ** 2 < slowest;
-      const stays = wasSlow && vx * vx + vy * vy < slowest && islands.touches[islands.label[n]];
+      const stays = wasSlow && vx * vx + vy * vy < slowest && islands.rests[islands.label[n]];
       vel[2 * n] = stays ? 0 : vx;
       vel[2 * n + 1] = stays ? 0 : vy;
       if (held && held.mask[n]) for (let a = 0; a < 2; a++) vel[2 * n + a] = held.move[a] / dt;
