@@ -80,6 +80,7 @@ class GraphBuilder:
     - ``wall``: normal, distance [m] and friction of the plane of the nearest wall [node, dim + 2]; zero without a wall within the radius
     - ``relief``: how much farther this wall seems to be, because it is sharp or thin there [node] in m (see ``geometry.relief``); zero
       in scenes without shapes, such as mirror images, and without ``reads_relief``
+    - ``rest_gap``: distance of the undeformed node from walls [node] in m; infinite where it is not known, and without ``reads_relief``
     - ``corner_index`` [pair, 2] and ``corner`` [pair, dim + 1], for each pair of an edge of a body and a nearby corner of an obstacle: the nodes at the ends of
       the edge; the vector from the first of them to the corner [m] and the friction of the corner. Empty in 3D
     - ``touch_index`` and ``touch``: pairs of nodes of different bodies within ``schema.TOUCH_REACH`` and the radius [pair, 2], and the vector from the second

@@ -71,6 +71,7 @@ def add_cells(
         entries = (_entries_in_compiled_loops if compiled else _entries)(topology, state, material, at_rest, scales, precision)
         wall = entries["wall"]
         entries["relief"] = _reliefs(state, topology.rows[material], wall, scales.spacing) if reads_relief else wall.new_zeros(len(wall))
+        entries["rest_gap"] = _rest_gaps(topology, state, material).to(wall) if reads_relief else torch.full_like(wall[:, 0], torch.inf)
         touching = _touching(topology, state, material, TOUCH_REACH * scales.spacing, precision)
         own = {"cell_index": at_rest.cell_index, "attached_index": at_rest.attached_index, "rest_pos": at_rest.pos}
         data[material].update({**own, **entries, **touching})
@@ -174,6 +175,28 @@ def _reliefs(state: State, rows: Tensor, wall: Tensor, spacing: float) -> Tensor
     found = reliefs(boundary.shapes, points[beside], np.minimum(distance[near, 0], PROBED * spacing), spacing)
     relief[torch.from_numpy(near).to(relief.device)] = torch.from_numpy(found).to(relief)
     return relief
+
+
+def _rest_gaps(topology: Topology, state: State, material: str) -> Tensor:
+    """Return how far the undeformed nodes [node] are from walls [m]; infinite without cells, and where the undeformed shape reaches into a wall.
+
+    The result is kept with the mesh for as long as the boundary is the same.
+    """
+    rows, mesh, boundary = topology.rows[material], topology.mesh, state.boundary
+    if mesh is None or state.cells is None or not len(rows) or not len(boundary.pos):
+        return state.pos.new_full((len(rows),), torch.inf)
+    now = boundary.made_once("version", object)
+    kept: dict[str, tuple[object, Tensor]] = mesh.__dict__.setdefault("_rest_gaps", {})  # not a field, so neither compared nor stored
+    if material not in kept or kept[material][0] is not now:
+        pos = as_numpy(mesh.rest_pos[rows])
+        if boundary.shapes:
+            gap = signed_distance(boundary.shapes, pos)
+        else:  # planes of the nearest boundary nodes
+            nearest = boundary.tree(topology.periodicity).query(pos)[1]
+            way = topology.periodicity.shortest(pos - as_numpy(boundary.pos)[nearest])
+            gap = (way * as_numpy(boundary.normal)[nearest]).sum(axis=1)
+        kept[material] = now, torch.from_numpy(np.where(gap > 0, gap, np.inf)).to(state.pos.device)
+    return kept[material][1]
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ WALL_DAMPING = 0.6
 """Damping of the layer of walls at the wall, as a fraction of the critical one. Elastomers that fall level bounce with it as in the material point method."""
 THINNEST = 0.01
 """Least thickness of the layer of walls, in rest spacings."""
-ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "relief", "cell_index", "attached_index", "corner_index", "corner")
+ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "relief", "rest_gap", "cell_index", "attached_index", "corner_index", "corner")
 """Entries of a material's store that the law reads."""
 
 
@@ -67,7 +67,8 @@ class WallLayer(nn.Module):
 
     The material point method has such a layer. Its particles feel a wall as soon as they share a cell of the grid with it, and deform on their way to it. The
     layer slips: bodies slide even on walls to which they should stick. So a friction μ acts as ``μ / (1 + μ/M)``, with the largest friction M. The layer is
-    thinner where a solid is sharp or thin, by the relief of the solid, because the grid hardly sees it there (see ``geometry.relief``).
+    thinner where a solid is sharp or thin, by the relief of the solid, because the grid hardly sees it there (see ``geometry.relief``). The material point
+    method does not push an undeformed body that lies at a wall, so the layer of a node is never thicker than its distance from walls in the undeformed shape.
 
     The damping is given. From single steps a model learns so much of it that bodies bounce too low, since the solver remembers a contact that the state does
     not show, such as how near to the wall a body was.
@@ -90,12 +91,18 @@ class WallLayer(nn.Module):
         return friction / (1.0 + friction * (-self.log_most_friction).exp().to(friction)) if self.has_thickness else friction
 
     def of_nodes(
-        self, relief: Float[Tensor, " node"], modulus: Float[Tensor, " node"], mass: Float[Tensor, " node"], spacing: Tensor
+        self,
+        relief: Float[Tensor, " node"],
+        rest_gap: Float[Tensor, " node"],
+        modulus: Float[Tensor, " node"],
+        mass: Float[Tensor, " node"],
+        spacing: Tensor,
     ) -> Float[Tensor, "node 3"] | None:
         """Return the layer of each node as ``elastic_motion.Walls`` has it; None without a layer.
 
         Args:
             relief: relief of the nearest solid [m].
+            rest_gap: distance of the undeformed node from walls [m].
             modulus: λ + 2μ in units of mean mass × spacing^(2 - dim) per frame².
             mass: masses in units of their mean.
             spacing: rest spacing [m].
@@ -104,7 +111,7 @@ class WallLayer(nn.Module):
             return None
         thickness, stiffness = (x.exp().to(modulus) for x in (self.log_thickness, self.log_stiffness))
         per_mass = stiffness * modulus / (thickness * mass)
-        depth = (thickness * spacing - relief).clamp(min=THINNEST * spacing).to(per_mass)
+        depth = torch.minimum(thickness * spacing - relief, rest_gap).clamp(min=THINNEST * spacing).to(per_mass)
         return torch.stack([depth, per_mass, 2.0 * self.damping * per_mass.sqrt()], dim=1)
 
 
@@ -242,8 +249,9 @@ class ElasticBodies(nn.Module):
         """Return the walls of the nodes of a material, on the device of its entries."""
         layer, spacing = cast(WallLayer, self.wall_layer[m]), self.spacing.to(mass.device)
         normal, gap, friction = store["wall"].split([self.dim, 1, 1], dim=1)
-        gap = gap[:, 0] - self.wall_distance[m].to(mass.device) * spacing
-        of_layer = layer.of_nodes(store["relief"], modulus, mass, spacing)
+        stop = self.wall_distance[m].to(mass.device) * spacing
+        of_layer = layer.of_nodes(store["relief"], store["rest_gap"] - stop, modulus, mass, spacing)
+        gap = gap[:, 0] - stop
         return Walls(normal, gap, layer.slipping(friction[:, 0] * self.log_friction[m].exp().to(mass.device)), of_layer)
 
     def _touching(self, m: str, data: HeteroData, params: Tensor, lame: tuple[Tensor, Tensor]) -> Touching:

@@ -70,6 +70,48 @@ def test_the_layer_pushes_less_where_a_wall_is_sharp(plain: bool) -> None:
     assert pushed[0] > 2.0 * pushed[1] > 0.0 and pushed[2] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("plain", [False, True], ids=["compiled", "plain"])
+@pytest.mark.parametrize("has_shapes", [True, False])
+def test_the_layer_does_not_push_an_undeformed_body_that_starts_in_it(has_shapes: bool, plain: bool) -> None:
+    simulated, state = simulator(network=0.0, wall_layer=2.0), scenes.mesh_state("lattice", ("elastomer",), seed=0)
+    assert state.rest_pos is not None
+    floor = float(state.rest_pos[:, 1].min()) - 0.5 * scenes.SPACING
+    walls = Boundary.sample(domain_walls(((-1.0, 2.0), (floor, floor + 3.0)), 0.3), scenes.SPACING, 2)
+    still = np.zeros_like(state.pos)
+    boundary = walls if has_shapes else replace(walls, shapes=())
+    start = replace(
+        state,
+        pos=state.rest_pos,
+        vel=still,
+        velocity_history=still[:, None],
+        frame_velocity=still,
+        gravity=0 * state.gravity,
+        boundary=boundary,
+    )
+    with torch.no_grad(), unfused() if plain else nullcontext():
+        assert (simulated.step(start.to_torch()).pos - torch.from_numpy(state.rest_pos)).abs().max() < 1e-6 * scenes.SPACING
+        lower = replace(start, pos=state.rest_pos - [0.0, 0.3 * scenes.SPACING]).to_torch()
+        assert float(simulated.step(lower).vel[:, 1].max()) > 0.0, "nearer than at rest, it is pushed"
+        graph, deeper = (
+            simulated.builder(start.to_torch()),
+            Boundary.sample(domain_walls(((-1.0, 2.0), (floor - 1.0, 2.0)), 0.3), scenes.SPACING, 2),
+        )
+        assert float(graph["elastomer"].rest_gap.min()) == pytest.approx(0.5 * scenes.SPACING)
+        other = simulated.builder(replace(start, boundary=deeper if has_shapes else replace(deeper, shapes=())).to_torch())
+        assert float(other["elastomer"].rest_gap.min()) > 1.0, "of the new walls"
+
+
+def test_a_shape_at_rest_that_reaches_into_a_wall_says_nothing() -> None:
+    simulated, state = simulator(network=0.0, wall_layer=2.0), scenes.mesh_state("lattice", ("elastomer",), seed=0)
+    assert state.rest_pos is not None
+    middle = float(np.median(state.rest_pos[:, 1])) + 0.25 * scenes.SPACING
+    walls = Boundary.sample(domain_walls(((-1.0, 2.0), (middle, middle + 3.0)), 0.3), scenes.SPACING, 2)
+    above = replace(state, pos=state.rest_pos + np.array([0.0, 1.0]), boundary=walls, velocity_history=state.vel[:, None])
+    gap = simulated.builder(above.to_torch())["elastomer"].rest_gap.numpy()
+    below = state.rest_pos[:, 1] < middle
+    assert below.any() and np.isinf(gap[below]).all() and np.isfinite(gap[~below]).all()
+
+
 def test_a_graph_has_the_relief_of_obstacles_and_none_of_domain_walls() -> None:
     """Nodes farther than 1.5 spacings have the relief of the point in front of the wall at this distance, since they may reach it within the frame."""
     simulated = simulator(("solid",), wall_layer=2.0)

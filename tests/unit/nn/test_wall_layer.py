@@ -15,8 +15,11 @@ SPACING = torch.tensor(0.02).double()
 MODULUS, MASS = torch.tensor([4.0, 8.0, 8.0]), torch.tensor([1.0, 1.0, 2.0])
 
 
-def of_nodes(layer: WallLayer, relief: tuple[float, ...] = (0.0, 0.0, 0.0)) -> torch.Tensor:
-    found = layer.of_nodes(torch.tensor(relief).double() * SPACING, MODULUS, MASS, SPACING)
+FAR = (math.inf, math.inf, math.inf)
+
+
+def of_nodes(layer: WallLayer, relief: tuple[float, ...] = (0.0, 0.0, 0.0), rest_gap: tuple[float, ...] = FAR) -> torch.Tensor:
+    found = layer.of_nodes(torch.tensor(relief).double() * SPACING, torch.tensor(rest_gap).double() * SPACING, MODULUS, MASS, SPACING)
     assert found is not None
     return found
 
@@ -31,6 +34,13 @@ def test_the_layer_is_thinner_by_the_relief_of_a_sharp_solid() -> None:
     layer = WallLayer(2.0)
     found = of_nodes(layer, (0.0, 0.6, 5.0))
     assert found[:, 0].tolist() == pytest.approx([2.0 * 0.02, 1.4 * 0.02, THINNEST * 0.02])
+    assert found[:, 1].tolist() == pytest.approx(of_nodes(layer)[:, 1].tolist())
+
+
+def test_the_layer_is_no_thicker_than_the_distance_of_the_undeformed_body() -> None:
+    layer = WallLayer(2.0)
+    found = of_nodes(layer, (0.0, 0.6, 0.0), (0.5, 3.0, 0.0))
+    assert found[:, 0].tolist() == pytest.approx([0.5 * 0.02, 1.4 * 0.02, THINNEST * 0.02])
     assert found[:, 1].tolist() == pytest.approx(of_nodes(layer)[:, 1].tolist())
 
 
@@ -69,5 +79,5 @@ def test_a_layer_without_thickness_does_nothing() -> None:
 
 def test_without_thickness_there_is_no_layer() -> None:
     layer = WallLayer(0.0)
-    assert layer.of_nodes(torch.zeros(3), MODULUS, MASS, SPACING) is None
+    assert layer.of_nodes(torch.zeros(3), torch.zeros(3), MODULUS, MASS, SPACING) is None
     assert not [*layer.parameters()] and layer.slipping(torch.ones(3)).tolist() == [1.0] * 3
