@@ -49,7 +49,7 @@ from gpe_pl.nn.static_friction import keeps_position, pushed
 from gpe_pl.nn.stores import predicted_rows
 from gpe_pl.rollout.loop import SimulationError, sound
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.schema import BOUNDARY, EdgeType
+from gpe_pl.schema import EdgeType
 from gpe_pl.system.signatures import check_plain, checked
 from gpe_pl.trajectory.rigid_bodies import all_of_bodies
 from gpe_pl.trajectory.scene_ranges import described, outside, scene_range, unlimited
@@ -192,7 +192,9 @@ class LearnedSimulator(nn.Module):
         if fraction and not self.builder.spec.islands:
             raise SceneError(f"static_friction={fraction:g}: needs a model that was trained with graph.islands=true; 0 turns it off")
         if fraction and not self.builder.config.boundary_condition:  # graphs do not say which walls are below
-            raise SceneError(f"static_friction={fraction:g}: needs a model that was trained with graph.boundary_condition=true; 0 turns it off")
+            raise SceneError(
+                f"static_friction={fraction:g}: needs a model that was trained with graph.boundary_condition=true; 0 turns it off"
+            )
         self._static_friction = float(fraction)
 
     @property
@@ -497,7 +499,9 @@ class LearnedSimulator(nn.Module):
         island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
-        is_supported = next_states.supported_in(graph, self.builder.spec, state.gravity, pushed(state, island, self.builder.metadata.frame_dt))
+        is_supported = next_states.supported_in(
+            graph, self.builder.spec, state.gravity, pushed(state, island, self.builder.metadata.frame_dt)
+        )
         stays = keeps_position(state.vel, new.vel, island, is_supported, self.slowest(state.gravity))
         stays = all_of_bodies(stays, state.rigid_body)[:, None]
         new = new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))

@@ -20,7 +20,6 @@ from torch import Tensor
 from gpe_pl.trajectory.boundary import as_numpy
 from gpe_pl.trajectory.state import State
 
-
 LEVEL = 1e-4
 """Rounding that the cosine of a wall's slope may have, so that a frictionless level floor bears."""
 

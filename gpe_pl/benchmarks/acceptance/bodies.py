@@ -1,4 +1,4 @@
-"""Acceptance of models of bodies that bend: symmetric blocks that fall flat on a floor, at three stiffnesses.
+"""Acceptance of models of bodies that bend: symmetric blocks that fall flat on a floor or lie on it, at three stiffnesses.
 
 A symmetric body that meets a flat floor keeps its symmetry. It neither turns nor moves sideways, whatever its material. Stiffer bodies deform less.
 """
@@ -21,8 +21,10 @@ from gpe_pl.benchmarks.acceptance.trial import (
     follows_parameter,
     listed,
     near_solver,
+    not_above_solver,
     shown,
     tried,
+    tried_from_rest,
 )
 from gpe_pl.learned.verdicts import Check
 from gpe_pl.metrics.bodies import Bodies, body_metrics
@@ -42,6 +44,8 @@ MAX_MIRROR = 5.0
 BOUNCE_TOLERANCE = 0.25
 DEFORMATION_RATIO = (0.8, 1.25)
 """Range of the rms deformation over the solver's."""
+PLACED_SECONDS, MAX_RISE = 0.3, 0.5
+"""Duration of the scene of a block on the floor [s], and the largest rise of its centre [spacings]."""
 WINDOW = 10
 """Number of frames over which a sideways speed is averaged."""
 
@@ -66,6 +70,22 @@ def dropped(columns: int, rows: int, name: str, candidate: Candidate) -> Result:
         contained(name, trials),
     ]
     return Result(checks, shown(candidate, trials, 0.2, 0.6))
+
+
+def placed(columns: int, rows: int, candidate: Candidate) -> Result:
+    """Place a block of ``columns`` × ``rows`` squares on the floor, and check that nothing throws it up."""
+    trials = [
+        tried_from_rest(candidate, value, scenes.placed_block(candidate.spec, value, columns, rows), PLACED_SECONDS)
+        for value in candidate.values
+    ]
+    checks = [not_above_solver("block on the floor: rise", [t.measured(rise) for t in trials], MAX_RISE, " spacings")]
+    return Result(checks, shown(candidate, trials, 0.5, 1.0))
+
+
+def rise(trajectory: Trajectory) -> float:
+    """Return the largest height of the centre of mass above its start, in spacings."""
+    height = centre(trajectory)[:, -1]
+    return float((height - height[0]).max()) / trajectory.metadata.spacing
 
 
 def _bodies(trajectory: Trajectory) -> Bodies:

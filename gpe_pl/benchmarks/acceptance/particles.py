@@ -1,4 +1,4 @@
-"""Acceptance of models of sand and snow: a column that collapses, a pile at rest, one that is too steep, and a ball of snow on a cylinder."""
+"""Acceptance of models of sand and snow: a column that collapses, a pile at rest, one that is too steep, a ball of snow on a cylinder, and released blocks."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from gpe_pl.benchmarks.acceptance.trial import (
     Result,
     advanced,
     at_most,
+    centre,
     contained,
     follows_parameter,
     near_solver,
@@ -20,6 +21,7 @@ from gpe_pl.benchmarks.acceptance.trial import (
     of_size,
     shown,
     tried,
+    tried_from_rest,
 )
 from gpe_pl.metrics import energy_distance
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -43,6 +45,8 @@ MAX_SLIDING = 0.5
 """Largest mean speed of a deposit at the end, in spacings per second."""
 AT_END = 0.2
 """Time at the end over which motion is measured [s]."""
+RELEASED_SECONDS, FALL_TOLERANCE = 0.2, 0.15
+"""Duration of the fall of a released block [s], and largest relative difference of its fall from the solver's."""
 
 
 def column(candidate: Candidate) -> Result:
@@ -89,6 +93,25 @@ def slump(candidate: Candidate) -> Result:
     trial = tried(candidate, lowest, steep, SECONDS)
     checks = [of_size("pile that is too steep: way", [trial.measured(creep)], " spacings/s"), contained("pile that is too steep", [trial])]
     return Result(checks, shown(candidate, [trial], 0.0, 0.25, 0.5, 0.75, 1.0))
+
+
+def released(candidate: Candidate) -> Result:
+    """Release blocks at rest under the ceiling and beside a side wall. Nothing holds them, since the walls have no friction."""
+    spec, value = candidate.spec, candidate.values[1]
+    starts = [scenes.leaning(spec, value, 8, 4, "ceiling"), scenes.leaning(spec, value, 4, 8, "side")]
+    trials = [tried_from_rest(candidate, value, start, RELEASED_SECONDS) for start in starts]
+    falls = [trial.measured(fall) for trial in trials]
+    checks = [
+        near_solver("released under a ceiling, beside a wall: fall", falls, FALL_TOLERANCE, 0.25 * candidate.spacing, " m"),
+        contained("released under a ceiling, beside a wall", trials),
+    ]
+    return Result(checks, shown(candidate, trials, 0.5, 1.0))
+
+
+def fall(trajectory: Trajectory) -> float:
+    """Return how far the centre of mass is below its start at the end [m]."""
+    height = centre(trajectory)[:, -1]
+    return float(height[0] - height[-1])
 
 
 def creep(trajectory: Trajectory) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -95,6 +95,11 @@ def dropped_block(spec: DatasetSpec, value: float, columns: int, rows: int, gap:
     return start(spec, value, pos, (0.0, -speed), domain_walls(spec.scene.bounds, COULOMB), cells)
 
 
+def placed_block(spec: DatasetSpec, value: float, columns: int, rows: int) -> State:
+    """Return a block of ``columns`` × ``rows`` squares at rest, half a spacing above the middle of the floor, as the solver's bodies lie."""
+    return dropped_block(spec, value, columns, rows, 0.5 * spec.scene.spacing, 0.0)
+
+
 # --- particles in 2D ------------------------------------------------------------------------------------------------------------------------
 
 
@@ -113,6 +118,15 @@ def column(spec: DatasetSpec, value: float, columns: int, rows: int) -> State:
     both = np.concatenate([left, left * [-1, 1] + [columns, 0]])
     pos = middle_of_floor(spec) + spec.scene.spacing * (both - [columns / 2, 0])
     return start(spec, value, pos, np.zeros(2), domain_walls(spec.scene.bounds, STICKY))
+
+
+def leaning(spec: DatasetSpec, value: float, columns: int, rows: int, wall: Literal["ceiling", "side"]) -> State:
+    """Return a block of ``columns`` × ``rows`` particles at rest under the ceiling, or beside the left wall at mid-height. Walls have no friction."""
+    lattice = integer_lattice(np.zeros(2, int), np.array([columns - 1, rows - 1])) + 0.5
+    block = spec.scene.spacing * (lattice + np.random.default_rng(0).uniform(-JITTER, JITTER, lattice.shape))
+    size, (low, high) = spec.scene.spacing * np.array([columns, rows]), np.array(spec.scene.bounds).T
+    corner = np.array([low[0], middle(spec)[1]]) if wall == "side" else np.array([middle(spec)[0] - size[0] / 2, high[1] - size[1]])
+    return start(spec, value, corner + block, np.zeros(2), domain_walls(spec.scene.bounds, 0.0))
 
 
 def ball_over_cylinder(spec: DatasetSpec, value: float, radius: int, cylinder: float, speed: float) -> State:

@@ -36,10 +36,12 @@ RESUMES = True
 SCENES: dict[str, dict[str, Callable[[Candidate], Result]]] = {
     "beam": {m: partial(bodies.dropped, 20, 4, "flat beam") for m in ("solid", "elastomer")},
     "square": {m: partial(bodies.dropped, 12, 10, "square block") for m in ("solid", "elastomer")},
+    "placed": {m: partial(bodies.placed, 12, 10) for m in ("solid", "elastomer")},
     "column": {"sand": particles.column},
     "pile": {"sand": particles.pile},
     "slump": {"sand": particles.slump},
     "cylinder": {"snow": particles.ball_on_cylinder},
+    "released": dict.fromkeys(("sand", "snow"), particles.released),
     "pool": {"fluid": liquid.pool_at_rest},
     "dam_break": {"fluid": liquid.dam_break},
     "flight": dict.fromkeys(("sand", "snow", "elastomer", "fluid", "solid"), flight.free_flight),

@@ -115,17 +115,32 @@ def tried(candidate: Candidate, value: float, start: State, seconds: float) -> T
     Raises:
         TrialError: the solver stopped early, so there is nothing to compare with.
     """
+    history = candidate.simulator.builder.config.history
+    whole, finer = _solved(candidate, start, seconds, history)
+    return _trial(candidate, value, whole.frames(history), finer.frames(history), candidate.simulator.initial_state(whole, history))
+
+
+def tried_from_rest(candidate: Candidate, value: float, start: State, seconds: float) -> Trial:
+    """Do the same as ``tried`` for a scene at rest. Both start at ``start``: the model's history is that of nodes that have not moved before."""
+    truth, finer = _solved(candidate, start, seconds, 0)
+    return _trial(candidate, value, truth, finer, candidate.simulator.standing(start, candidate.metadata()))
+
+
+def _solved(candidate: Candidate, start: State, seconds: float, history: int) -> tuple[Trajectory, Trajectory]:
+    """Return the rollouts of the solver, and of the solver with half its time step, over the duration and the frames of the history before it."""
     solver: Any = candidate.spec.solver
-    history, metadata = candidate.simulator.builder.config.history, candidate.metadata()
-    num_frames = max(2, round(seconds / solver.frame_dt))
+    num_frames, metadata = max(2, round(seconds / solver.frame_dt)), candidate.metadata()
     whole = rollout(solver, start, history + num_frames, metadata)
     finer = rollout(HalfSteps(solver), start, history + num_frames, metadata)
     for run, name in ((whole, "the solver"), (finer, "the solver with half its time step")):
         if run.termination is not None:
             raise TrialError(f"{candidate.spec.name}: {name} stopped early, so there is nothing to compare with: {run.termination.message}")
-    truth = whole.frames(history)
-    model, corrected = predicted(candidate, candidate.simulator.initial_state(whole, history), truth)
-    return Trial(value, truth, finer.frames(history), model, math.nan if model.termination is not None else corrected)
+    return whole, finer
+
+
+def _trial(candidate: Candidate, value: float, truth: Trajectory, finer: Trajectory, state: State) -> Trial:
+    model, corrected = predicted(candidate, state, truth)
+    return Trial(value, truth, finer, model, math.nan if model.termination is not None else corrected)
 
 
 def advanced(solver: Simulator, state: State, num_steps: int) -> State:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Literal
+
 import numpy as np
 import pytest
 
-from gpe_pl.benchmarks.acceptance import scenes
+from gpe_pl.benchmarks.acceptance import bodies, particles, scenes
 from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.rollout.guard import unsound
 from gpe_pl.solvers.scenes import describe
 from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
+from tests.conftest import make_trajectory
 
 
 def sound(spec: DatasetSpec, state: State) -> bool:
@@ -49,6 +54,28 @@ def test_columns_and_balls_are_symmetric_and_seeded() -> None:
         assert sound(spec, state) and is_mirrored(state.pos, 0.5)
     assert column.num_nodes == 24
     assert np.array_equal(column.pos, scenes.column(spec, 40.0, 6, 4).pos)  # the parameter alone differs
+
+
+@pytest.mark.parametrize(("wall", "columns", "rows"), [("ceiling", 8, 4), ("side", 4, 8)])
+def test_a_leaning_block_touches_a_wall_without_friction(wall: Literal["ceiling", "side"], columns: int, rows: int) -> None:
+    spec = dataset("data=snow", "size=small")
+    state = scenes.leaning(spec, 7.0, columns, rows, wall)
+    (left, _), (low, high) = spec.scene.bounds
+    gap = high - state.pos[:, 1].max() if wall == "ceiling" else state.pos[:, 0].min() - left
+    assert sound(spec, state) and state.num_nodes == columns * rows and not state.vel.any()
+    assert 0 < gap < 0.6 * spec.scene.spacing and not state.boundary.friction.any()
+    assert state.pos[:, 1].min() - low > 0.3 * (high - low), "room to fall"
+
+
+def test_a_released_block_falls_by_how_far_its_centre_sinks() -> None:
+    made = make_trajectory(num_frames=3, num_nodes=4)
+    up = np.eye(made.metadata.dim)[-1]
+
+    def moved(*heights: float) -> Trajectory:
+        return replace(made, pos=(made.pos[:1] + np.array(heights)[:, None, None] * up).astype(made.pos.dtype))
+
+    assert particles.fall(moved(0.0, -0.2, -0.5)) == pytest.approx(0.5, rel=1e-5)
+    assert bodies.rise(moved(0.0, 0.3, -0.1)) == pytest.approx(0.3 / made.metadata.spacing, rel=1e-5)
 
 
 @pytest.mark.parametrize("scene", ["bowl", "dam_break"])
