@@ -55,7 +55,7 @@ PICTURES = (
     "channel.png",
     *("acceptance_fem_beam.png", "acceptance_elastomer_square.png", "acceptance_sand_column.png"),
     "scenes/*_00000_misfit.png",
-    *("acceptance_snow_cylinder.png", "acceptance_fluid_dam_break.png", "acceptance_sand_slump.png"),
+    *("acceptance_snow_cylinder.png", "acceptance_snow_released.png", "acceptance_fluid_dam_break.png", "acceptance_sand_slump.png"),
 )
 FILM = "rollout_test_00.gif"
 MAX_WIDTH = 1400
