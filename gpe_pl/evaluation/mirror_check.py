@@ -31,7 +31,7 @@ def mirror_equivariance_error(simulator: LearnedSimulator, trajectory: Trajector
 
     Raises:
         MirrorError: gravity acts along every axis, or there is none and all walls face one way along every axis.
-        IndexError: there are too few frames before ``start_frame``.
+        FrameError: there are too few frames before ``start_frame``.
         SceneError: the scene does not fit the simulator.
     """
     metadata, history = trajectory.metadata, simulator.builder.config.history

@@ -323,7 +323,7 @@ class LearnedSimulator(nn.Module):
         of the training data. Each kind of warning appears once.
 
         Raises:
-            IndexError: there are too few frames before ``frame``, or no such frame.
+            FrameError: there are too few frames before ``frame`` (start at one with ``standing``), or no such frame.
             SceneError: the frame interval, spacing, dimension or materials differ from training, or a value is not finite or breaks its rule; the message names
             the node.
         """
@@ -361,8 +361,8 @@ class LearnedSimulator(nn.Module):
         """
         if self.fits(scene):
             return
-        own, choice = self.builder.metadata, choice or "data=… size=…"
-        if (stride := self.stride_on(scene)) > 1 and choice == "data=… size=…":
+        own, choice = self.builder.metadata, choice or training_ranges.CHOICE
+        if (stride := self.stride_on(scene)) > 1 and choice == training_ranges.CHOICE:
             choice = f"every frame number {stride}: Trajectory.every({stride}), or data.stride={stride}"
         strided = f" (data.stride={self.stride})" if self.stride > 1 else ""
         scales = f"frame_dt={own.frame_dt:g} s{strided} and spacing={own.spacing:g} m"

@@ -20,6 +20,8 @@ FARTHEST = 2.0
 """Factor by which spacing and frame interval of a scene may be outside their ranges in training."""
 MASS_FACTOR = 2.0
 """Factor by which masses of nodes may leave the range of training, because corners of meshes differ between bodies of one kind."""
+CHOICE = "data=… size=…, or in Python give Trajectory.from_numpy the frame_dt, spacing and materials of the training"
+"""What to do about a scene that does not fit a model, if no stride makes it fit."""
 
 
 def stored_ranges(metadata: Metadata, material: str, trained: Tensor) -> Iterator[tuple[MaterialParameter, int, Tensor]]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from array_api_compat import array_namespace, device
 
+from gpe_pl.errors import GpeError
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.trajectory.arrays import ArrayError
 from gpe_pl.trajectory.boundary import Array, Boundary
@@ -17,6 +18,21 @@ from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.kinds import CELL, GROUP, NODE, PARTS, SCENE, STEP, names_of
 from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.openings import Opening
+
+
+class FrameError(GpeError, IndexError):
+    """Raised when a trajectory does not have a frame, or not the frames before it that a state with history needs."""
+
+
+def check_frame(frame: int, history: int, num_frames: int) -> None:
+    """Raise ``FrameError`` if a trajectory of ``num_frames`` frames lacks a frame, or ``history`` frames before it."""
+    if not history <= frame < num_frames:
+        first = (
+            f", of which {history} to {num_frames - 1} have this history"
+            if history < num_frames
+            else "; give more, or start with LearnedSimulator.standing"
+        )
+        raise FrameError(f"frame {frame} with history {history} is outside the {num_frames} frames of this trajectory{first}")
 
 
 @dataclass(frozen=True)

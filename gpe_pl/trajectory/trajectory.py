@@ -38,7 +38,7 @@ from gpe_pl.trajectory.living import held, living, order_of_entry
 from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.openings import Opening
 from gpe_pl.trajectory.rest_positions import near_origin
-from gpe_pl.trajectory.state import State, Stress
+from gpe_pl.trajectory.state import State, Stress, check_frame
 
 log = logging.getLogger(__name__)
 
@@ -413,10 +413,9 @@ class Trajectory:
         float64, as a learned simulator needs them, and the stored ones become ``State.frame_velocity``.
 
         Raises:
-            IndexError: ``frame`` is out of range, or has fewer than ``history`` frames before it.
+            FrameError: ``frame`` is out of range, or has fewer than ``history`` frames before it.
         """
-        if not history <= frame < self.num_frames:
-            raise IndexError(f"frame {frame} with history {history} is outside the {self.num_frames} frames of this trajectory")
+        check_frame(frame, history, self.num_frames)
         gravity = np.asarray(self.metadata.gravity)
         pos, vel, past = self.pos[frame].astype(np.float64), self.vel[frame].astype(np.float64), None
         at_frame = vel if history else None

@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 import pytest
 
+from gpe_pl.errors import GpeError
 from gpe_pl.schema import NODE_TYPES, SCHEMA_VERSION
 from gpe_pl.trajectory.state import Stress, von_mises
 from gpe_pl.trajectory.store import StoreError, iter_trajectories, read_metadata, read_trajectory, shards, trajectory_names, write_shard
@@ -414,8 +415,10 @@ def test_a_part_has_a_frame(shard: Path, trajectory: Trajectory) -> None:
 
 @pytest.mark.parametrize(("frame", "history"), [(-1, 0), (6, 0), (2, 3), (6, 2)])
 def test_state_outside_the_trajectory(trajectory: Trajectory, frame: int, history: int) -> None:
-    with pytest.raises(IndexError, match=f"frame {frame} with history {history} is outside the 6 frames"):
+    """A command prints it as one line; others catch what a wrong number raises everywhere."""
+    with pytest.raises(IndexError, match=f"frame {frame} with history {history} is outside the 6 frames") as failure:
         trajectory.state(frame, history)
+    assert isinstance(failure.value, GpeError)
 
 
 def test_to_torch_and_back(trajectory: Trajectory) -> None:
