@@ -17,9 +17,6 @@ from gpe_pl.trajectory.cells import fitting_kinds, stacked
 RADIUS_SPACINGS = 2.0
 """Default connectivity radius in rest spacings: about 12 neighbours in the plane and 32 in space."""
 
-ROUNDING = 1e-6
-"""Relative difference of lengths below which they may be equal."""
-
 FRAMES_AT_ONCE = 256
 NEIGHBOURS = 16
 MAX_VISITED = 50_000
@@ -334,26 +331,6 @@ def _checked_kind(name: str, array: np.ndarray, kind: str, codes: np.ndarray) ->
             f"{name}: cell {cell} has nodes of {found}; a cell is of one material, and meshes are of {', '.join(MESH_MATERIALS)}"
         )
     return array
-
-
-def check_counted_from_0(cells: np.ndarray, rest_pos: np.ndarray, periodicity: Periodicity) -> None:
-    """Raise ``ArrayError`` if cells [cell, corner] count nodes from 1: node 0 is in no cell, and with numbers less by one the cells have shorter sides.
-
-    Args:
-        cells: nodes of each cell [cell, corner], all of which exist.
-        rest_pos: undeformed positions [node, dim] in m.
-        periodicity: axes along which space repeats.
-    """
-
-    def sides(corners: np.ndarray) -> float:
-        ways = periodicity.shortest((rest_pos[corners] - rest_pos[np.roll(corners, 1, axis=1)]).astype(np.float64))
-        return float(np.linalg.norm(ways, axis=-1).sum())
-
-    if len(cells) and cells.min() == 1 and sides(cells - 1) < (1 - ROUNDING) * sides(cells):
-        raise ArrayError(
-            f"cells: node 0 is in no cell, and the nodes of cell 0, {cells[0].tolist()}, are nearer to each other if they are counted from 1; "
-            "subtract 1 from all numbers, or put nodes without cells last"
-        )
 
 
 def velocities_of(pos: np.ndarray, frame_dt: float, periodicity: Periodicity) -> np.ndarray:

@@ -43,6 +43,22 @@ def lame_parameters(youngs_modulus: FloatOrArray, poisson_ratio: float | np.ndar
     return first, shear  # type: ignore[return-value]
 
 
+def local_gradients(dim: int, num_corners: int) -> tuple[Float[np.ndarray, "point corner dim"], float]:
+    """Return the gradients of the shape functions at the quadrature points of an undistorted cell, and the volume of each of its points.
+
+    Args:
+        dim: dimension of the cell.
+        num_corners: dim + 1 for a simplex, 2^dim for a quadrilateral or hexahedron.
+    """
+    if num_corners == dim + 1:
+        return np.concatenate([-np.ones((1, dim)), np.eye(dim)])[None], 1.0 / math.factorial(dim)
+    signs = _SIGNS[dim]
+    points = signs * _GAUSS
+    factor = (1 + points[:, None] * signs) / 2  # of the shape functions ∏ (1 + ξ_k s_k) / 2 [point, corner, dim]
+    slopes = [math.prod(signs[:, k] / 2 if k == axis else factor[..., k] for k in range(dim)) for axis in range(dim)]
+    return np.stack(slopes, axis=-1), 1.0
+
+
 def shape_gradients(
     corners: Float[np.ndarray, "cell corner dim"],
 ) -> tuple[Float[np.ndarray, "cell point corner dim"], Float[np.ndarray, "cell point"]]:
@@ -58,15 +74,7 @@ def shape_gradients(
         gradients mean nothing.
     """
     count, dim = corners.shape[1:]
-    if count == dim + 1:
-        local = np.concatenate([-np.ones((1, dim)), np.eye(dim)])[None]
-        volume = 1.0 / math.factorial(dim)
-    else:
-        signs = _SIGNS[dim]
-        points = signs * _GAUSS
-        factor = (1 + points[:, None] * signs) / 2  # of the shape functions ∏ (1 + ξ_k s_k) / 2 [point, corner, dim]
-        slopes = [math.prod(signs[:, k] / 2 if k == axis else factor[..., k] for k in range(dim)) for axis in range(dim)]
-        local, volume = np.stack(slopes, axis=-1), 1.0
+    local, volume = local_gradients(dim, count)
     jacobian = np.einsum("cai,qaj->cqij", corners, local)
     determinant = np.linalg.det(jacobian)
     safe = np.where((determinant != 0)[..., None, None], jacobian, np.eye(dim))

@@ -18,7 +18,6 @@ from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.arrays import (
     RADIUS_SPACINGS,
     ArrayError,
-    check_counted_from_0,
     checked_bodies,
     checked_bounds,
     checked_cells,
@@ -34,6 +33,7 @@ from gpe_pl.trajectory.arrays import (
 )
 from gpe_pl.trajectory.boundary import Array, Boundary, check_steps, has_nodes_beside_shapes
 from gpe_pl.trajectory.cells import mean_over_corners
+from gpe_pl.trajectory.cells_at_rest import check_at_rest
 from gpe_pl.trajectory.living import held, living, order_of_entry
 from gpe_pl.trajectory.loads import Loads
 from gpe_pl.trajectory.openings import Opening
@@ -345,7 +345,7 @@ class Trajectory:
         if cells is not None:
             cells, cell_dim = checked_cells(cells, codes, dim)
             rest_pos = numbers("rest_pos", pos[0] if rest_pos is None else rest_pos, {"node": num_nodes, "dim": dim})
-            check_counted_from_0(cells, rest_pos, periodicity)
+            check_at_rest(cells, cell_dim, rest_pos, periodicity)
             rest_pos = near_origin(rest_pos, pos, periodicity).astype(pos.dtype)
         elif rest_pos is not None:
             raise ArrayError("rest_pos: only meshes have rest positions; pass cells too, or leave it out")

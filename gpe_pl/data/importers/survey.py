@@ -16,6 +16,7 @@ from gpe_pl.data.importers.source import Facts, Item, Loaded, Refusal
 from gpe_pl.data.position_rounding import MotionSummary, motion_of
 from gpe_pl.data.validate import outside_bounds
 from gpe_pl.schema import HISTORY, NODE_TYPES, stored_parameters
+from gpe_pl.trajectory import cells_at_rest
 from gpe_pl.trajectory.arrays import nearest_distances
 from gpe_pl.trajectory.rigid_deformation import rigid_deformation
 from gpe_pl.trajectory.store import stored_arrays
@@ -151,6 +152,9 @@ class Survey:
         if len(at_one_place):
             what = f"{len(at_one_place)} nodes are at the place of another node, the first is node {at_one_place[0]}: do bodies overlap?"
             self.suspects.append(Event(split, name, 0, what))
+        if trajectory.cells is not None and trajectory.rest_pos is not None:
+            mesh = (trajectory.cells, trajectory.cell_dim, trajectory.rest_pos, m.periodicity)
+            self.suspects += [Event(split, name, -1, what) for what in cells_at_rest.suspects(*mesh)]
         there = nearest if trajectory.alive is None else nearest[trajectory.alive[0]]
         self.nearest.append((split, name, float(np.median(there)) if len(there) else np.inf))
         self.lengths.append((split, name, trajectory.num_frames))

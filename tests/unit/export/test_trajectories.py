@@ -106,9 +106,16 @@ NAMES = {
 
 
 def meshed(name: str) -> Trajectory:
-    """Return a mesh that swings; the positions of its nodes do not affect the kinds of its cells."""
+    """Return a mesh that swings, of cells that are a little distorted."""
     dim, count, cells = MESHES[name]
-    rest = np.random.default_rng(0).uniform(0.3, 0.7, (count, dim))
+    points = np.random.default_rng(0).uniform(0.0, 0.3, (count, dim))
+    if "quadrilateral" in cells:
+        points[:, :2] += np.argwhere(GRID >= 0)
+    elif "hexahedron" in cells:
+        points[:8] += np.argwhere(np.ones((2, 2, 2)))[:, ::-1]
+    elif "wedge" in cells:
+        points[:6] += [[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (0, 1))]
+    rest = 0.3 + 0.1 * points
     swing = 0.01 * np.sin(np.arange(8)[:, None, None] + rest)
     return Trajectory.from_numpy(rest + swing, 0.01, "elastomer", {"elastomer": 1e5}, cells=cells)
 

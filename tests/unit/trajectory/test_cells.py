@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import CELL_KINDS
 from gpe_pl.trajectory.arrays import ArrayError
 from gpe_pl.trajectory.cells import bodies, cell_edges, is_corner, kinds_of, mean_over_corners
+from gpe_pl.trajectory.cells_at_rest import suspects
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import read_trajectory, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -103,7 +105,9 @@ def test_dimensions_that_no_cell_has(dim: int, cell_dim: int, allowed: str) -> N
 def mixed() -> Trajectory:
     """Return two bodies of all kinds of cells in space but quadrilaterals, which move."""
     random = np.random.default_rng(0)
-    pos = random.uniform(0.2, 0.8, (1, 20, 3)) + np.cumsum(random.normal(scale=1e-3, size=(8, 20, 3)), axis=0)
+    start = random.uniform(0.2, 0.8, (20, 3))
+    start[:11] = 0.2 + 0.3 * np.concatenate([CORNERS["hexahedron"], [[1.5, 0.5, 0], [1.5, 0.5, 1], [1.5, 1.5, 0.5]]])
+    pos = start + np.cumsum(random.normal(scale=1e-3, size=(8, 20, 3)), axis=0)
     kinds = {
         "hexahedron": [[0, 1, 2, 3, 4, 5, 6, 7]],
         "wedge": [[1, 2, 8, 5, 6, 9]],
@@ -202,3 +206,84 @@ def test_rest_positions_in_the_coordinates_of_the_positions_keep_these(offset: f
     rest = near.rest_pos + offset
     there = Trajectory.from_numpy(near.pos + offset, 0.01, "elastomer", {"elastomer": 1e5}, cells=QUADRILATERALS, rest_pos=rest)
     np.testing.assert_array_equal(there.rest_pos, rest)
+
+
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+UP = np.array([0, 0, 1])
+CORNERS = {
+    "quadrilateral": SQUARE,
+    "wedge": np.concatenate([SQUARE[:3], SQUARE[:3] + UP]),
+    "hexahedron": np.concatenate([SQUARE, SQUARE + UP]),
+    "tetrahedron": np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float),
+    "triangle": SQUARE[:3],
+}
+
+
+def single(kind: str, order: list[int], dim: int, stretch: float = 1.0, **space: Any) -> Trajectory:
+    """Return a trajectory of two cells of a kind, the second with another order of its corners; all of them are turned and sheared."""
+    shear = np.random.default_rng(1).normal(size=(dim, dim)) * 0.2 + np.eye(dim) * 0.1
+    corners = CORNERS[kind][:, :dim] @ shear
+    rest = np.concatenate([corners, corners + 0.5])
+    rest[:, 0] *= stretch
+    pos = rest + 1e-3 * np.random.default_rng(0).normal(size=(5, *rest.shape))
+    cells = {kind: np.stack([np.arange(len(corners)), len(corners) + np.array(order)])}
+    return Trajectory.from_numpy(pos, 0.01, "elastomer", {"elastomer": 1e5}, cells=cells, rest_pos=rest, spacing=0.1, **space)
+
+
+@pytest.mark.parametrize(
+    ("kind", "dim", "order"),
+    [
+        ("quadrilateral", 2, [0, 1, 3, 2]),
+        ("quadrilateral", 3, [0, 1, 3, 2]),
+        ("quadrilateral", 2, [0, 2, 1, 3]),
+        ("wedge", 3, [0, 1, 2, 3, 5, 4]),
+        ("hexahedron", 3, [0, 1, 3, 2, 4, 5, 7, 6]),
+        ("hexahedron", 3, [0, 1, 2, 3, 7, 6, 5, 4]),
+        ("hexahedron", 3, [0, 1, 2, 3, 4, 5, 7, 6]),
+    ],
+)
+def test_tangled_cells_are_refused(kind: str, dim: int, order: list[int]) -> None:
+    with pytest.raises(ArrayError, match=f"cells: {kind} 1 with the corners .* is tangled: .* corners must run in VTK's order"):
+        single(kind, order, dim)
+
+
+@pytest.mark.parametrize(
+    ("kind", "dim", "order"),
+    [
+        ("triangle", 2, [0, 2, 1]),
+        ("triangle", 3, [0, 2, 1]),
+        ("tetrahedron", 3, [0, 2, 1, 3]),
+        ("quadrilateral", 2, [0, 3, 2, 1]),
+        ("quadrilateral", 3, [1, 2, 3, 0]),
+        ("wedge", 3, [3, 4, 5, 0, 1, 2]),
+        ("hexahedron", 3, [4, 5, 6, 7, 0, 1, 2, 3]),
+    ],
+)
+@pytest.mark.parametrize("stretch", [1.0, 1e-3])
+def test_cells_of_either_orientation_are_sound(kind: str, dim: int, order: list[int], stretch: float) -> None:
+    """Thin cells, too."""
+    trajectory = single(kind, order, dim, stretch)
+    assert trajectory.cells is not None and trajectory.rest_pos is not None
+    assert [*suspects(trajectory.cells, trajectory.cell_dim, trajectory.rest_pos, trajectory.metadata.periodicity)] == []
+
+
+def test_cells_across_a_seam_are_not_tangled() -> None:
+    space = {"bounds": [[0, 0.25], [0, 0.9]], "periodic": [True, False], "connectivity_radius": 0.11}
+    lattice = mesh_of(QUADRILATERALS)
+    pos, rest = np.mod(lattice.pos, [0.25, 0.9]), np.mod(lattice.rest_pos, [0.25, 0.9])
+    across = np.array([[6, 0, 1, 7]])  # from 0.2 to 0.25, the image of 0
+    for cells, sound in ((across, True), (across[:, [0, 1, 3, 2]], False)):
+        with contextlib.nullcontext() if sound else pytest.raises(ArrayError, match="tangled"):
+            Trajectory.from_numpy(pos, 0.01, "elastomer", {"elastomer": 1e5}, cells=cells, rest_pos=rest, spacing=0.1, **space)
+
+
+@pytest.mark.parametrize("offset", [0.0, 500000.25])
+def test_cells_without_volume_and_cells_that_occur_twice_are_suspects(offset: float) -> None:
+    """The three nodes of a row are in one line. A cell is the same one whichever corner comes first."""
+    trajectory = mesh_of(QUADRILATERALS[:, :3])
+    assert trajectory.cells is not None and trajectory.rest_pos is not None
+    cells = np.concatenate([trajectory.cells, [[0, 1, 2], [4, 1, 0]], trajectory.cells[2:3]])
+    rest, space = trajectory.rest_pos.round(1) + offset, trajectory.metadata.periodicity
+    flat, twice = suspects(cells, 2, rest, space)
+    assert flat == "1 cells have no volume at rest, the first is cell 4: are corners in one line or plane?"
+    assert twice.startswith("1 cells have the corners of another cell, the first is cell 6")

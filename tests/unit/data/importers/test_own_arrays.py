@@ -68,6 +68,9 @@ def test_several_parameters_of_a_material(tmp_path: Path) -> None:
 def test_own_cells_by_kind(tmp_path: Path) -> None:
     values: dict[str, Any] = {"frame_dt": DT, "materials": "elastomer", "params_elastomer": 1e5}
     cells: dict[str, Any] = {"cells_triangle": [[0, 1, 2]], "cells_quadrilateral": [[0, 3, 4, 5], [6, 7, 8, 9]]}
+    rest, square = motion(dim=3)[0], [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.1, 0.0], [0.0, 0.1, 0.0]]
+    rest[[0, 3, 4, 5]], rest[[6, 7, 8, 9]] = square, square
+    values["rest_pos"] = rest
     (tmp_path / "raw").mkdir()
     for k in range(3):
         np.savez(
