@@ -26,6 +26,7 @@ from gpe_pl.graphs.islands import unwrapped
 from gpe_pl.metrics import displacement
 from gpe_pl.schema import CELL_KINDS
 from gpe_pl.trajectory.cells import cell_edges, is_corner, kinds_of
+from gpe_pl.trajectory.source_origin import KEY, origin_of
 from gpe_pl.trajectory.state import von_mises
 from gpe_pl.trajectory.store import PREDICTION, stored_arrays, stored_attributes
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -47,7 +48,8 @@ def write_npz(path: Path | str, trajectory: Trajectory) -> None:
     """Write a trajectory as arrays that ``numpy.load`` reads, in the precision of the store. The file is written atomically.
 
     Names, shapes and units are those of ``schema.FIELDS``; ``metadata``, ``shapes`` and ``node_types`` are JSON. Rollouts of models also have
-    ``prediction``. ``convert format=arrays`` imports such files, other than rollouts of models.
+    ``prediction``. If an import moved the origin, ``origin`` [dim] in m is where it is in the coordinates of the source: add it to positions and bounds.
+    ``convert format=arrays`` imports such files, other than rollouts of models.
 
     Raises:
         ValueError: ``path`` does not end in ``.npz``.
@@ -57,8 +59,10 @@ def write_npz(path: Path | str, trajectory: Trajectory) -> None:
         raise ValueError(f"{path}: a NumPy archive ends in .npz")
     texts = {key: np.array(text) for key, text in stored_attributes(trajectory).items()}
     texts |= {PREDICTION: np.array("")} if trajectory.is_prediction else {}
+    origin = origin_of(trajectory.metadata)
+    moved = {} if origin is None else {KEY: origin}
     with replacing(path) as part:
-        np.savez_compressed(part, allow_pickle=False, **stored_arrays(trajectory), **texts)
+        np.savez_compressed(part, allow_pickle=False, **stored_arrays(trajectory), **texts, **moved)
 
 
 def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory | None = None, stride: int = 1) -> None:
@@ -68,6 +72,8 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     have ``displacement`` from rest [m], ``error`` (distance from the ground truth [m], NaN for nodes that it does not have in that frame), ``stress`` [Pa] and
     ``von_mises`` [Pa]. Cells have the last two as well, NaN on particles. Moving boundary nodes are points like others; ``boundary.vtu`` has the rest, with
     ``normal``, ``friction`` and ``restitution``.
+
+    Positions are in the coordinates of the source. If an import moved the origin, they are written in double precision.
 
     An earlier series at this path is replaced: those of its files that the new one does not have are removed.
 
@@ -124,7 +130,7 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
             if moved is not None:
                 points["displacement"] = _in_3d(moved[frame])
             pos, _ = unwrapped(trajectory.pos[frame].astype(np.float64), edges, trajectory.metadata.periodicity)
-            pos = pos.astype(trajectory.pos.dtype)
+            pos = _in_source(pos.astype(trajectory.pos.dtype), trajectory)
             if trajectory.alive is not None:
                 pos, cells, points = _living(trajectory, frame, pos, points)
             replace_text(folder / name, _grid(pos, cells, points, in_cells))
@@ -134,7 +140,7 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
         boundary = trajectory.boundary
         if len(boundary.pos):
             data = {"normal": _in_3d(boundary.normal), "friction": boundary.friction, "restitution": boundary.restitution}
-            replace_text(folder / BOUNDARY, _grid(boundary.pos, _vertices(np.arange(len(boundary.pos))), data, {}))
+            replace_text(folder / BOUNDARY, _grid(_in_source(boundary.pos, trajectory), _vertices(np.arange(len(boundary.pos))), data, {}))
             written.add(BOUNDARY)
         replace_text(path, _document("Collection", "<Collection>\n" + "\n".join(entries) + "\n</Collection>"))
     for old in folder.glob("*.vtu"):
@@ -152,6 +158,12 @@ def _whole(folder: Path) -> Iterator[None]:
         if is_new:
             shutil.rmtree(folder, ignore_errors=True)
         raise
+
+
+def _in_source(pos: np.ndarray, trajectory: Trajectory) -> np.ndarray:
+    """Return positions [node, dim] in m in the coordinates of the source of the data."""
+    origin = origin_of(trajectory.metadata)
+    return pos if origin is None else pos.astype(np.float64) + origin
 
 
 class _Cells(NamedTuple):

@@ -42,6 +42,7 @@ from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.openings import Opening
+from gpe_pl.trajectory.source_origin import without_origin
 from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
@@ -332,7 +333,7 @@ class Scene:
         if faults:
             raise SceneFault(faults, self)
         self._warn_of_pushes(found, simulator)
-        metadata = replace(own, dataset="scene", bounds=self.box, gravity=self.gravity, split="", seed=self.seed)
+        metadata = replace(without_origin(own), dataset="scene", bounds=self.box, gravity=self.gravity, split="", seed=self.seed)
         state = self._joined(found, values, united(shapes, own.spacing), own)
         return state.opened([opening for _, opening in openings]) if openings else state, metadata
 

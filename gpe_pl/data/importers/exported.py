@@ -15,6 +15,8 @@ import numpy as np
 from gpe_pl.data.importers import npz
 from gpe_pl.data.importers.source import Facts, Loaded, Refusal
 from gpe_pl.schema import FIELDS
+from gpe_pl.trajectory import source_origin
+from gpe_pl.trajectory.arrays import numbers
 from gpe_pl.trajectory.store import ADVICE, ATTRIBUTES, FURTHER, PREDICTION, StoreError, UnsoundError, fill_group, trajectory_in
 
 KEY = "metadata"
@@ -38,9 +40,10 @@ def load(path: Path, names: Sequence[str], given: Facts) -> Loaded:
     if wrong := [field.name for field in fields(Facts) if getattr(given, field.name) != getattr(Facts(), field.name)]:
         raise Refusal(f"is an exported trajectory, which states {wrong[0]} itself; leave {wrong[0]} out of the command")
     texts = [name for name in names if name in (*ATTRIBUTES, *FURTHER)]
-    if unknown := [name for name in names if name not in FIELDS and name not in texts]:
+    if unknown := [name for name in names if name not in (*FIELDS, *texts, source_origin.KEY)]:
         raise Refusal(f"has an unknown key {unknown[0]!r} beside those of an exported trajectory")
     arrays = {name: npz.read(path, name) for name in names}
+    origin = arrays.pop(source_origin.KEY, None)
     for name in texts:
         if arrays[name].dtype.kind != "U" or arrays[name].ndim:
             raise Refusal(f"{name} is {arrays[name].dtype}{list(arrays[name].shape)}, expected text")
@@ -56,5 +59,7 @@ def load(path: Path, names: Sequence[str], given: Facts) -> Loaded:
             raise Refusal(str(error).removeprefix(f"{path.name}:trajectory: ").removesuffix(f"; {ADVICE}")) from None
     if trajectory.openings:
         raise Refusal("is an open scene, which cannot be imported")
+    if origin is not None:  # back to the coordinates of the source, as positions of any other archive
+        trajectory = trajectory.seen_from(-numbers("origin", origin, {"dim": trajectory.metadata.dim}).astype(np.float64))
     what = "its name is that of a rollout of a model, which is no ground truth (evaluation.export); leave the file out if it is one"
     return Loaded(trajectory, warnings=(what,) if path.name.startswith("rollout_") else ())

@@ -232,6 +232,38 @@ def test_an_archive_holds_what_the_store_holds(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
 
 
+def single(trajectory: Trajectory) -> Trajectory:
+    """Return the trajectory in the precision of the store."""
+    return replace(trajectory, pos=trajectory.pos.astype(np.float32))
+
+
+@pytest.mark.parametrize("config", ["", "sand", "[1]", '{"origin": [1.0]}', '{"origin": ["a", "b"]}', '{"origin": [0.0, 0.0]}'])
+def test_other_settings_move_nothing(tmp_path: Path, config: str) -> None:
+    other = replace(single(falling(2)), metadata=replace(falling(2).metadata, config=config))
+    write_npz(tmp_path / "a.npz", other)
+    write_vtk(tmp_path / "a.pvd", other)
+    assert "origin" not in np.load(tmp_path / "a.npz").files
+    assert series(tmp_path / "a.pvd")[0][1].points.dtype == np.float32
+
+
+def test_files_know_the_coordinates_of_the_source(tmp_path: Path) -> None:
+    """Archives say where the origin was moved to. Series for ParaView are in the coordinates of the source, beside which they are shown."""
+    truth, origin = single(falling(2)), np.array([500123.0, 5800321.0])
+    moved = replace(truth, metadata=replace(truth.metadata, config='{"origin": [500123.0, 5800321.0]}'))
+    write_npz(tmp_path / "a.npz", moved)
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
+        assert archive["origin"].tolist() == origin.tolist()
+        np.testing.assert_array_equal(archive["pos"], truth.pos)
+    write_vtk(tmp_path / "a.pvd", moved, truth)
+    for frame, (_, grid) in enumerate(series(tmp_path / "a.pvd")):
+        assert grid.points.dtype == np.float64
+        np.testing.assert_allclose(grid.points[:, :2] - origin, truth.pos[frame], atol=1e-8)
+        np.testing.assert_array_equal(grid.points[:, 2], 0)
+        np.testing.assert_array_equal(grid.point_data["error"], 0)
+    boundary = meshio.read(tmp_path / "a" / "boundary.vtu")
+    np.testing.assert_allclose(boundary.points[:, :2] - origin, truth.boundary.pos, atol=1e-8)
+
+
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     truth = falling(2)
     with pytest.raises(ValueError, match=r"a VTK series ends in \.pvd"):

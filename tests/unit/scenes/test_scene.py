@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,6 +30,7 @@ from gpe_pl.scenes.rollouts import predicted
 from gpe_pl.scenes.scene import Scene, SceneFault
 from gpe_pl.scenes.scene_file import read_scene
 from gpe_pl.schema import node_code
+from gpe_pl.trajectory.source_origin import origin_of
 
 ROOT = Path(__file__).parents[3]
 SPACING = 0.015625  # of the shipped model of sand
@@ -44,6 +46,16 @@ def bar(material: str, thickness: float) -> Scene:
 @cache
 def model(name: str) -> LearnedSimulator:
     return LearnedSimulator.from_checkpoint(name)
+
+
+def test_a_scene_has_coordinates_of_its_own() -> None:
+    """Those of imported data may have been moved; exports of their rollouts are moved back, and those of a scene stay where they are."""
+    moved = model("sand").configured()
+    values = json.loads(moved.builder.metadata.config)
+    moved.builder = replace(moved.builder, metadata=replace(moved.builder.metadata, config=json.dumps({**values, "origin": [5.0, 0.0]})))
+    assert origin_of(moved.builder.metadata) is not None
+    _, metadata = column().state(moved)
+    assert origin_of(metadata) is None and json.loads(metadata.config) == values
 
 
 def column(**properties: Any) -> Scene:

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset
+from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset, save_dataset
 from gpe_pl.export.trajectories import write_npz
-from gpe_pl.trajectory.store import stored_arrays, stored_attributes
+from gpe_pl.trajectory.store import iter_trajectories, stored_arrays, stored_attributes
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests.unit.data.importers.test_formats import imported
 
@@ -44,6 +44,21 @@ def test_exported_trajectories_come_back(tmp_path: Path, scenes: list[Trajectory
         assert stored_attributes(after)["shapes"] == stored_attributes(before)["shapes"]
         assert after.metadata.param_names == before.metadata.param_names
         assert (after.metadata.bounds, after.metadata.gravity) == (before.metadata.bounds, before.metadata.gravity)
+
+
+def test_a_moved_origin_comes_back_too(tmp_path: Path) -> None:
+    """The archive says where the origin is, so what is imported from it again is in the coordinates of the first source."""
+    offset, random = np.array([500000.0, 5800000.0]), np.random.default_rng(0)
+    start = offset + 0.1 * np.stack(np.meshgrid(np.arange(3), np.arange(3)), axis=-1).reshape(-1, 2)
+    far = [start + np.cumsum(random.normal(scale=1e-3, size=(8, 9, 2)), axis=0) for _ in range(3)]
+    made = [Trajectory.from_numpy(pos, 0.01, "elastomer", {"elastomer": 1e5}, cells=[[0, 1, 4, 3]]) for pos in far]
+    report = save_dataset(tmp_path / "data", "first", holdout=0.0, train=made)
+    near = [*iter_trajectories(report.folder, "train")]
+    again, stored = imported(tmp_path, exported(tmp_path / "raw", near), "arrays", holdout=0.0)
+    assert not again.refusals and again.origin == report.origin and np.any(report.origin)
+    for before, after in zip(near, stored["train"], strict=True):
+        np.testing.assert_allclose(after.pos, before.pos, atol=1e-7)
+        np.testing.assert_allclose(after.rest_pos, before.rest_pos, atol=1e-7)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
@@ -87,6 +102,7 @@ def test_damage_is_named(tmp_path: Path, scenes: list[Trajectory]) -> None:
         ("pos", scenes[0].pos.astype(np.float64), "field 'pos' is float64[8, 12, 2], expected float32"),
         ("metadata", np.array("{}"), "metadata unreadable"),
         ("metadata", np.array([1.0]), "metadata is float64[1], expected text"),
+        ("origin", np.array([1.0]), "origin: has shape [1], expected [dim 2]"),
         ("colour", np.array([1.0]), "has an unknown key 'colour'"),
     ):
         folder = tmp_path / f"{name}_{array.dtype}_{array.size}"
