@@ -268,8 +268,9 @@ def test_cells_of_either_orientation_are_sound(kind: str, dim: int, order: list[
 
 
 def test_cells_across_a_seam_are_not_tangled() -> None:
-    space = {"bounds": [[0, 0.25], [0, 0.9]], "periodic": [True, False], "connectivity_radius": 0.11}
+    space: dict[str, Any] = {"bounds": [[0, 0.25], [0, 0.9]], "periodic": [True, False], "connectivity_radius": 0.11}
     lattice = mesh_of(QUADRILATERALS)
+    assert lattice.rest_pos is not None
     pos, rest = np.mod(lattice.pos, [0.25, 0.9]), np.mod(lattice.rest_pos, [0.25, 0.9])
     across = np.array([[6, 0, 1, 7]])  # from 0.2 to 0.25, the image of 0
     for cells, sound in ((across, True), (across[:, [0, 1, 3, 2]], False)):
