@@ -39,6 +39,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         stride_of,
     )
     from gpe_pl.data.checksum import split_checksum
+    from gpe_pl.data.frame_velocities import warn_of_means
     from gpe_pl.evaluation.rollouts import as_evaluated, evaluate
     from gpe_pl.evaluation.settings import EvaluationSettings
     from gpe_pl.evaluation.uncertainty import Uncertainty
@@ -74,6 +75,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     folder = Path(cfg.paths.runs) / run_name(cfg.name)
     with locked(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
         root = ensure_split(evaluated, cfg.split)
+        warn_of_means(simulator, root, cfg.split)
         claim(folder, _identity(evaluated, root, simulator), results=["*"])
         with without_orphans(folder):
             try:

@@ -27,6 +27,7 @@ from gpe_pl.config.entry_point import ConfigError, bind, construct
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import every, open_split, window_counts
+from gpe_pl.data.frame_velocities import warn_of_means
 from gpe_pl.data.sampling import BatchSize
 from gpe_pl.evaluation.metric_rows import LEARNED, read_rows
 from gpe_pl.evaluation.rollouts import evaluate
@@ -142,6 +143,7 @@ class FitRun:
             check_same_frames(scenes, rolled_out)
         self.solver = self._solver_of_targets()
         self.root, *others = (ensure_data(part) for part in self.parts)
+        warn_of_means(untrained, self.root, "train")
         self.others = list(zip(others, map(stride_of, self.parts[1:]), strict=True))
         is_same = not self.cfg.evaluation.data and len(self.parts) == 1
         self.evaluated_root = self.root if is_same else ensure_data(evaluated)

@@ -334,7 +334,7 @@ def _checked_kind(name: str, array: np.ndarray, kind: str, codes: np.ndarray) ->
 
 
 def velocities_of(pos: np.ndarray, frame_dt: float, periodicity: Periodicity) -> np.ndarray:
-    """Return velocities [frame, node, dim] in m/s as differences to the frame before; the first frame has those of the second."""
+    """Return mean velocities over the frame before each frame [frame, node, dim] in m/s; the first frame has those of the second."""
     vel = np.empty(pos.shape, np.float32)
     for start in range(1, len(pos), FRAMES_AT_ONCE):  # double precision of all frames at once would take too much memory
         window = pos[start - 1 : start + FRAMES_AT_ONCE].astype(np.float64)

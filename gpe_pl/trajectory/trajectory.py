@@ -286,7 +286,7 @@ class Trajectory:
             materials: material of all nodes, or of each node; names of ``schema.MATERIALS``.
             params: parameters of each material that occurs, in the units of ``schema.MATERIALS``: one value, or one per node of the trajectory. A material
                 has its first parameter, or several by name, ``{"elastomer": {"youngs_modulus": 1e5, "poisson_ratio": 0.3}}``.
-            vel: velocities [frame, node, dim] in m/s; None takes the differences of positions. Models learn from positions only.
+            vel: velocities at the frames [frame, node, dim] in m/s, which the elastic law needs; None takes means over the frame before each.
             mass: mass of all nodes, or of each node [kg]; required with forces. None stands for 1 kg, because only ratios matter to a model without forces.
             bounds: ``(low, high)`` of the domain per axis [m]; None takes the extremes of all positions. Periodic axes need bounds.
             periodic: whether space repeats, per axis; None stands for no axis.

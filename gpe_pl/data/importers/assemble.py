@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.data.checksum import split_checksum
+from gpe_pl.data.frame_velocities import ADVICE, are_means
 from gpe_pl.data.free_flight import joined, vector
 from gpe_pl.data.importers.given_values import without_effect
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
@@ -489,6 +490,8 @@ class _Conversion:
                 "or add scenes in which nodes touch something"
             )
         sample = list(islice(iter_trajectories(folder, split), NUM_SAMPLED))
+        if any(map(are_means, sample)):
+            report.notes.append(ADVICE)
         degrees = [degree for trajectory in sample for degree in degrees_of(trajectory)]
         among, boundary = (np.concatenate(part) for part in zip(*degrees, strict=True))
         report.neighbours = {
