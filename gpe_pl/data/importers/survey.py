@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gpe_pl.data.free_flight import FreeFlight, vector
+from gpe_pl.data.importers.frame_order import wrong_frames
 from gpe_pl.data.importers.recordings import Part, Recordings
 from gpe_pl.data.importers.report import Event
 from gpe_pl.data.importers.sampled import free_flight_of
@@ -35,8 +36,6 @@ COINCIDENCE = 1e-3
 """Nodes closer than this fraction of the median distance to the nearest node, in the first frame, count as at one place."""
 FRAMES_COMPARED = 200
 """Number of first frames in which displacements and velocities are compared."""
-STANDING = 0.01
-"""Fraction of the median way in a frame above which nodes move."""
 SPACING_RATIO = 3.0
 """A warning is given if two distances that should be alike differ by more than this factor."""
 USUAL = 0.75
@@ -141,9 +140,7 @@ class Survey:
             self.suspects.append(Event(split, name, -1, what))
         self.motions.append((split, name, motion_of(m, trajectory.pos)))
         self.assumes_gravity.append(loaded.assumes_gravity)
-        if (frame := _repeated_frame(trajectory)) is not None:
-            what = f"is equal to frame {frame - 1}, and nodes move before and after: was it written twice?"
-            self.suspects.append(Event(split, name, frame, what))
+        self.suspects += [Event(split, name, frame, what) for frame, what in wrong_frames(trajectory)]
         if trajectory.num_frames < LONG_ENOUGH:
             what = f"has {trajectory.num_frames} frames; models leave it out unless graph.history is below the default, which needs {LONG_ENOUGH}"
             self.suspects.append(Event(split, name, -1, what))
@@ -230,21 +227,6 @@ class Flight:
     name: str
     assumed: bool
     free: FreeFlight
-
-
-def _repeated_frame(trajectory: Trajectory) -> int | None:
-    """Return the first frame that is equal to the one before, although nodes move on in the frames before and after; None if there is none.
-
-    Nodes that turn back, as at the top of a throw, may be at the same place in two frames.
-    """
-    steps = trajectory.metadata.periodicity.shortest(np.diff(trajectory.pos.astype(np.float64), axis=0))
-    ways = np.abs(steps).max(axis=(1, 2), initial=0.0)
-    if not ways.any():
-        return None
-    moves = ways > STANDING * np.median(ways[ways > 0])
-    goes_on = np.einsum("fnd,fnd->f", steps[:-2], steps[2:]) > 0
-    repeated = np.flatnonzero((ways[1:-1] == 0) & moves[:-2] & moves[2:] & goes_on)
-    return int(repeated[0]) + 2 if len(repeated) else None
 
 
 def _velocity_ratio(trajectory: Trajectory) -> float | None:
