@@ -90,6 +90,7 @@ class MotionSummary:
         low, high: smallest and largest positions [dim] in m.
         frame_dt: time between frames [s].
         precision: coarsest floating-point type that represents all positions exactly, independent of the array's type.
+        is_whole: whether all positions are whole numbers.
         marks: distance of marks [dim] in m (see ``marks``); 0 if there are none coarser than ``precision``.
         acceleration: rms per component of accelerations without gravity [m/s²].
         mean_acceleration: mean acceleration without gravity [dim] in m/s².
@@ -102,6 +103,7 @@ class MotionSummary:
     high: np.ndarray
     frame_dt: float
     precision: Precision
+    is_whole: bool
     marks: np.ndarray
     acceleration: float
     mean_acceleration: np.ndarray
@@ -131,7 +133,7 @@ def motion_of(m: Metadata, pos: np.ndarray) -> MotionSummary:
         m: metadata of the trajectory.
         pos: positions [frame, node, dim] in m.
     """
-    precisions = list(PRECISIONS)
+    precisions, is_whole = list(PRECISIONS), True
     squares, total, farthest = 0.0, np.zeros(pos.shape[2]), (-1.0, 0, 0)
     changes: list[np.ndarray] = []
     for start in range(0, len(pos) - 2, FRAMES_AT_ONCE):
@@ -148,6 +150,7 @@ def motion_of(m: Metadata, pos: np.ndarray) -> MotionSummary:
         farthest = max(farthest, (float(step[frame, node]), start + int(frame) + 1, int(node)))
         with np.errstate(over="ignore"):  # an overflow counts as not exact
             precisions = [p for p in precisions if (window.astype(p) == window).all()]
+        is_whole &= bool((window == np.rint(window)).all())
     low, high = pos.min(axis=(0, 1)).astype(np.float64), pos.max(axis=(0, 1)).astype(np.float64)
     rounding = np.spacing(np.maximum(np.abs(low), np.abs(high)).astype(precisions[0])).astype(np.float64)
     return MotionSummary(
@@ -155,6 +158,7 @@ def motion_of(m: Metadata, pos: np.ndarray) -> MotionSummary:
         high=high,
         frame_dt=m.frame_dt,
         precision=precisions[0],
+        is_whole=is_whole,
         marks=np.array([marks(column, float(q)) for column, q in zip(np.concatenate(changes).T, rounding, strict=True)]),
         acceleration=math.sqrt(squares / pos[2:].size),
         mean_acceleration=total / (pos[2:].size / pos.shape[2]),

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.errors import GpeError
+from gpe_pl.errors.printable import did_you_mean
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.geometry.shapes import check_bounds
-from gpe_pl.schema import CELL_KINDS, LARGEST, MATERIALS, MESH_MATERIALS, NODE_TYPES, node_code, param_names, parameters_by_name
+from gpe_pl.schema import BOUNDARY, CELL_KINDS, LARGEST, MATERIALS, MESH_MATERIALS, NODE_TYPES, node_code, param_names, parameters_by_name
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import fitting_kinds, stacked
 
@@ -50,7 +51,7 @@ def numbers(name: str, values: Any, axes: Mapping[str, int | None]) -> np.ndarra
         raise ArrayError(f"{name}: is a masked array with {np.ma.count_masked(values)} masked values; only whole arrays can be used")
     try:
         array = np.asarray(values)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RuntimeError) as error:  # the last from tensors that require a gradient
         raise ArrayError(f"{name}: not an array of numbers ({error})") from None
     if array.dtype.kind not in "fiu":
         raise ArrayError(f"{name}: has type {array.dtype}, expected real numbers")
@@ -157,7 +158,9 @@ def checked_materials(
     present = tuple(m for m in MATERIALS if m in set(names))
     unknown = sorted(set(names) - set(MATERIALS))
     if unknown:
-        raise ArrayError(f"materials: node {names.index(unknown[0])} is {unknown[0]!r}; known: {', '.join(MATERIALS)}")
+        raise ArrayError(
+            f"materials: node {names.index(unknown[0])} is {unknown[0]!r}{_instead_of(unknown[0])}; known: {', '.join(MATERIALS)}"
+        )
     if not isinstance(params, Mapping) or set(params) != set(present):
         wanted = ", ".join(f"{m}: {MATERIALS[m][0].name} [{MATERIALS[m][0].unit}]" for m in present)
         given = ", ".join(sorted(params)) if isinstance(params, Mapping) else "no names"
@@ -185,6 +188,13 @@ def checked_materials(
                 raise ArrayError(f"params[{material!r}]: node {node} has {spec.name} = {spec.quantity(values[node])}, must be {spec.rule}")
             columns[rows, stored.index(spec.name)] = values[rows]
     return codes, columns, present, stored
+
+
+def _instead_of(name: str) -> str:
+    """Return what may be meant by a name that is no material, for messages."""
+    if name == BOUNDARY:
+        return ", which is no material (give walls as boundary, in files as boundary_pos)"
+    return did_you_mean(name.lower(), MATERIALS) if name.lower() not in MATERIALS else f" (did you mean {name.lower()!r}?)"
 
 
 def checked_bodies(rigid_body: Any, num_nodes: int) -> np.ndarray:

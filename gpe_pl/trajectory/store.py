@@ -582,9 +582,9 @@ def shards(root: Path | str, split: str) -> list[Path]:
     if not found:
         others = sorted({path.parent.name for path in Path(root).glob("*/shard-*.h5")})
         lacks = f"has no split {split!r} but {', '.join(others)}" if others else "has no trajectories of any split"
-        raise StoreError(
-            f"{root}: {lacks}; generate it with `python -m gpe_pl.simulate`, import data that have it, or choose another split"
-        )
+        is_imported = Path(root).name == "imported"
+        remedy = "import data" if is_imported else "generate it with `python -m gpe_pl.simulate`, import data"
+        raise StoreError(f"{root}: {lacks}; {remedy} that have it, or choose another split")
     return found
 
 

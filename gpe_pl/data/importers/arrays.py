@@ -68,6 +68,7 @@ PREFIXES = ("params_", "cells_")
 """Prefixes of keys, followed by a material or a kind of cells."""
 PER_NODE = ("frame_dt", "materials", "mass", "bounds", "periodic", "gravity", "spacing", "connectivity_radius")
 """Keys with at most one value per node, or ``FEW`` values for the scene. Keys that begin with ``params_`` belong to them too."""
+AS_NUMBERS = "names as text, np.array(names, dtype=str), and frames of equal shape as one array, np.stack(frames)"
 FEW = 6
 """Maximum number of values that describe a scene."""
 SCALARS = ("frame_dt", "spacing", "connectivity_radius")
@@ -103,8 +104,10 @@ def _load(path: Path, stated: Facts, facts: Facts) -> Loaded:
                 pos = values.get("pos")
                 few = pos is not None and pos.ndim > 1 and (name in PER_NODE or name.startswith("params_"))
                 values[name] = npz.read(path, name, most_values=max(pos.shape[1], FEW) if few and pos is not None else None)
+    except npz.ObjectsRefused as refused:
+        raise Refusal(f"{refused.fault}; it is never read. Save {AS_NUMBERS}") from None
     except ImportFailure as failure:
-        raise Refusal(str(failure)) from None
+        raise Refusal(str(failure).removeprefix(f"{path}: ")) from None
     wrong = [name for name in names if name not in KEYS and not name.startswith(PREFIXES)]
     missing = [name for name in ("pos", "frame_dt", "materials") if name not in names]
     if wrong or missing:
@@ -118,6 +121,8 @@ def _load(path: Path, stated: Facts, facts: Facts) -> Loaded:
                 raise Refusal(f"{name} has shape {list(values[name].shape)}, expected one number")
             values[name] = values[name].item()
     materials = values["materials"]
+    if materials.dtype.kind == "S":  # as HDF5 files store text
+        materials = np.char.decode(materials, "utf-8", "replace")
     if materials.dtype.kind != "U":
         raise Refusal(f"materials is {materials.dtype}, expected text")
     values["materials"] = materials.item() if materials.ndim == 0 else materials.tolist()

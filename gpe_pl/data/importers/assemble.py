@@ -17,12 +17,12 @@ from gpe_pl.data.frame_velocities import ADVICE, are_means
 from gpe_pl.data.free_flight import joined, vector
 from gpe_pl.data.importers.given_values import without_effect
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
-from gpe_pl.data.importers.sampled import degrees_of, speed_and_acceleration
+from gpe_pl.data.importers.sampled import about_walls, degrees_of, speed_and_acceleration
 from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
 from gpe_pl.data.importers.splits import arranged
 from gpe_pl.data.importers.survey import NUM_SAMPLED, SPACING_RATIO, Survey
 from gpe_pl.data.importers.trained_parameters import TrainedParameters, parameters_in
-from gpe_pl.data.position_rounding import ROUNDING_FRACTION, better_origin, rounding_fault
+from gpe_pl.data.position_rounding import ROUNDING_FRACTION, MotionSummary, better_origin, rounding_fault
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.errors import GpeError
 from gpe_pl.files import sealed
@@ -52,6 +52,8 @@ FEWEST_NEIGHBOURS, MOST_NEIGHBOURS = 3.0, 60.0
 """A warning is given for a mean number of neighbours outside this range."""
 SHORT = 10 * HISTORY
 """With fewer frames, the report says how to use more of them."""
+SAME_LENGTH, SAME_MEASURED = 1.1, 1.5
+"""A warning is given if spacings or radii of trajectories differ by more than the first factor, or spacings that were measured by more than the second."""
 VELOCITY_RATIO = 1.25
 """A warning is given if displacements and velocities of a source differ by more than this factor."""
 TYPED = ("gns", "lagrangebench", "meshgraphnets", "calculix", "meshio")
@@ -73,6 +75,11 @@ def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Prog
     """
     path = Path(settings.source).expanduser()
     name = settings.name or path.name.partition(".")[0]
+    if not settings.name:
+        try:
+            data_name(name)
+        except NameRefused as error:
+            raise ImportFailure(f"{error}; pass name=…") from None
     folder = _free_folder(Path(root), name)
     if settings.materials and settings.format not in TYPED:
         raise ImportFailure(f"materials={settings.materials}: {settings.format} has no node types; {', '.join(TYPED)} have")
@@ -254,7 +261,7 @@ class _Conversion:
         assert survey.common is not None
         facts, (frame_dt, dim, periodic) = self.facts, survey.common
         spacing = facts.spacing or float(np.median(survey.spacings))
-        radius = facts.connectivity_radius or float(np.median(survey.radii))
+        radius = facts.connectivity_radius or float(np.median(survey.given_radii or survey.radii))
         bounds = facts.bounds
         if facts.spacing is None:
             report.notes.append(
@@ -264,6 +271,16 @@ class _Conversion:
             report.notes.append(
                 f"connectivity_radius is {radius / spacing:.3g} spacings (connectivity_radius=…, or later graph.connectivity_spacings=…)"
             )
+        of_lengths = (
+            ("spacing", survey.spacings, spacing, SAME_LENGTH if survey.has_given_spacings else SAME_MEASURED),
+            ("connectivity_radius", survey.given_radii, radius, SAME_LENGTH),
+        )
+        for name, known, stored, most in of_lengths:
+            if getattr(facts, name) is None and known and max(known) > most * min(known):
+                report.warnings.append(
+                    f"{name} is {min(known):.4g} … {max(known):.4g} m in the trajectories, and {stored:.4g} m is stored for all; choose {name}=…, "
+                    "or import trajectories of different spacing as different data sets"
+                )
         if bounds is None and not any(periodic):
             every = np.array(survey.bounds)
             bounds = tuple(zip(every[..., 0].min(axis=0).tolist(), every[..., 1].max(axis=0).tolist(), strict=True))
@@ -320,7 +337,7 @@ class _Conversion:
             else:
                 report.notes.append(f"{known} and is stored: {free} are too few to measure it (gravity=[…])")
         flight = joined((f for _, f in flights), dim)
-        report.free_groups = flight.num_free
+        report.free_groups, report.disturbed_groups = flight.num_free, flight.num_disturbed
         if flight.num_free:
             report.free_acceleration = flight.typical.tolist()
         if flight.agrees_on_another:
@@ -348,7 +365,7 @@ class _Conversion:
         for split, name, motion in motions:
             for error, where, remedy in (
                 (motion.rounding_to_marks, f"in steps of {motion.marks.max():.3g} m", "write them with more digits"),
-                (motion.rounding(motion.precision, nowhere), f"in {motion.precision.__name__}", "write them with more digits"),
+                (motion.rounding(motion.precision, nowhere), f"in {_steps_of(motion)}", "write them with more digits"),
                 (motion.rounding(np.float32, self.origin), "in float32", "take a larger time step, or a smaller domain"),
             ):
                 if fault := rounding_fault(float(error.max()), typical, where):
@@ -500,12 +517,18 @@ class _Conversion:
             "max": int(among.max()),
             "boundary": float(boundary.mean()),
         }
+        report.warnings += about_walls(sample)
         report.max_speed, report.mean_acceleration = speed_and_acceleration(sample)
         report.step_in_spacings = report.max_speed * report.frame_dt / report.spacing
         if not FEWEST_NEIGHBOURS <= among.mean() <= MOST_NEIGHBOURS:
             report.warnings.append(
                 f"{among.mean():.1f} neighbours within the radius are {'few' if among.mean() < FEWEST_NEIGHBOURS else 'many'}; choose connectivity_radius=…"
             )
+
+
+def _steps_of(motion: MotionSummary) -> str:
+    """Return what positions are rounded to, for messages."""
+    return "steps of 1 m, in whole numbers" if motion.is_whole else motion.precision.__name__
 
 
 def _united(span: tuple[float, float] | None, values: np.ndarray) -> tuple[float, float]:

@@ -236,6 +236,10 @@ def _readable(path: Path) -> Iterator[None]:
     except ModuleNotFoundError as error:
         raise Refusal(f"{path.name} needs the package {error.name}; install it with `pip install {error.name}`") from None
     except (Exception, SystemExit) as error:
+        if "Could not deduce file format" in str(error):
+            raise Refusal(
+                f"has files {path.suffix} such as {path.name}, which meshio does not know; save them as .vtu, or use format=arrays"
+            ) from None
         reason = " ".join(printed.getvalue().split()) if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
         raise Refusal(f"{path.name} cannot be read by meshio ({reason or 'it is damaged or of another format'})") from None
 

@@ -29,6 +29,18 @@ DAMAGE = (
 """Errors that reading a damaged archive or a pickle can raise."""
 
 
+class ObjectsRefused(ImportFailure):
+    """Raised for an array of Python objects if ``allow_pickle`` is false.
+
+    Attributes:
+        fault: what is wrong, without the path and the remedy.
+    """
+
+    def __init__(self, path: Path, name: str) -> None:
+        self.fault = f"{name!r} is an array of Python objects, a pickle, which can run any code when it is read"
+        super().__init__(f"{path}: {self.fault}. If you trust whoever wrote it, pass allow_pickle=true")
+
+
 def names(path: Path) -> list[str]:
     """Return the names of the arrays in an archive, in its order.
 
@@ -58,7 +70,7 @@ def read(path: Path, name: str, allow_pickle: bool = False, most_values: int | N
 
     Raises:
         Refusal: the array is damaged, larger than the archive, unpacks to far more than is stored, or has more than ``most_values`` values.
-        ImportFailure: the array has Python objects, and ``allow_pickle`` is false.
+        ObjectsRefused: the array has Python objects, and ``allow_pickle`` is false.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -77,10 +89,7 @@ def read(path: Path, name: str, allow_pickle: bool = False, most_values: int | N
                     raise Refusal(f"{name!r} has version {version} of the .npy format, expected one of {', '.join(map(str, HEADERS))}")
                 shape, dtype = _header(file, version, name)
                 if dtype.hasobject and not allow_pickle:
-                    raise ImportFailure(
-                        f"{path}: {name!r} is an array of Python objects, a pickle, which can run any code when it is read. If you trust whoever wrote "
-                        "it, pass allow_pickle=true"
-                    )
+                    raise ObjectsRefused(path, name)
                 if most_values is not None and math.prod(shape) > most_values:
                     raise Refusal(f"{name}: has shape {list(shape)}, at most {most_values} values are expected")
                 left = member.file_size - file.tell()

@@ -69,6 +69,7 @@ class Report:
         max_speed, mean_acceleration: largest speed [m/s], and mean acceleration with gravity per axis [m/s²], of the first ``assemble.NUM_SAMPLED`` training
             trajectories. In free fall the acceleration is gravity.
         free_groups: number of groups of nodes in free flight, over the examined frames.
+        disturbed_groups: number of these groups that do not accelerate with gravity.
         free_acceleration: median acceleration of these groups per axis [m/s²]; empty if there are none.
         step_in_spacings: displacement in one frame at ``max_speed``, in spacings.
         notes: assumptions and omissions that concern the whole data set.
@@ -96,6 +97,7 @@ class Report:
     acceleration_std: float = 0.0
     mean_acceleration: list[float] = field(default_factory=list)
     free_groups: int = 0
+    disturbed_groups: int = 0
     free_acceleration: list[float] = field(default_factory=list)
     step_in_spacings: float = 0.0
     notes: list[str] = field(default_factory=list)
@@ -136,7 +138,8 @@ class Report:
             for axis, (low, high), repeats in zip(axes, self.bounds, self.periodic, strict=True)
         )
         free = ", ".join(f"{a:.3g}" for a in self.free_acceleration)
-        measured = f"; {self.free_groups} groups in free flight accelerate by ({free}) m/s²" if self.free_groups else ""
+        groups = f"{self.free_groups} groups in free flight accelerate by ({free}) m/s², {self.disturbed_groups} of them not with gravity"
+        measured = f"; {groups}" if self.free_groups else ""
         rows = [
             ("frame dt", f"{self.frame_dt:.6g} s"),
             ("bounds", f"{box} m"),

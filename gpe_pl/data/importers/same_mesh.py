@@ -32,7 +32,8 @@ def in_one_order(frames: list[Frame]) -> list[Frame]:
     first = frames[0]
     for k, frame in enumerate(frames):
         if frame.points.shape != first.points.shape:
-            raise Refusal(f"{frame.file} has {len(frame.points)} points, {first.file} has {len(first.points)}; meshes must not change", k)
+            rule = "meshes must not change" if first.cells else "particles must be the same in all frames; leave out those that come or go"
+            raise Refusal(f"{frame.file} has {len(frame.points)} points, {first.file} has {len(first.points)}; {rule}", k)
     frames = _by_number(frames)
     for k, frame in enumerate(frames):
         same = frame.cells.keys() == first.cells.keys() and all(

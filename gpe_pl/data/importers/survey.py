@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -18,7 +19,8 @@ from gpe_pl.data.position_rounding import MotionSummary, motion_of
 from gpe_pl.data.validate import outside_bounds
 from gpe_pl.schema import HISTORY, NODE_TYPES, stored_parameters
 from gpe_pl.trajectory import cells_at_rest
-from gpe_pl.trajectory.arrays import nearest_distances
+from gpe_pl.trajectory.arrays import RADIUS_SPACINGS, nearest_distances
+from gpe_pl.trajectory.cells_at_rest import ROUNDING
 from gpe_pl.trajectory.rigid_deformation import rigid_deformation
 from gpe_pl.trajectory.store import stored_arrays
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
@@ -183,6 +185,18 @@ class Survey:
         if self.stressed and not has_stress:
             return "has no stress, which other trajectories have; give it to all or to none"
         return ""
+
+    @property
+    def has_given_spacings(self) -> bool:
+        """Whether the spacing of a sampled trajectory differs from the distance to the nearest node."""
+        pairs = zip(self.spacings, self.nearest[: len(self.spacings)], strict=True)
+        return not all(math.isclose(spacing, distance, rel_tol=ROUNDING) for spacing, (*_, distance) in pairs)
+
+    @property
+    def given_radii(self) -> list[float]:
+        """Connectivity radii of the sampled trajectories that are not the default [m]."""
+        pairs = zip(self.radii, self.spacings, strict=True)
+        return [radius for radius, spacing in pairs if not math.isclose(radius, RADIUS_SPACINGS * spacing, rel_tol=ROUNDING)]
 
     def look_for_outliers(self) -> None:
         """Add suspects: trajectories whose distances, length or free flight differ from those of the others."""

@@ -177,3 +177,21 @@ def test_numbers_of_points_that_do_not_tell_which_is_which_are_refused(
     write_folder(tmp_path / "raw", numbered(numbers))
     with pytest.raises(ImportFailure, match=message):
         imported(tmp_path, arrays={"stress": "S"}, frame_dt=DT)
+
+
+def test_particles_that_come_or_go_are_refused_as_such(tmp_path: Path) -> None:
+    (tmp_path / "raw" / "a").mkdir(parents=True)
+    for frame in range(4):
+        meshio.Mesh(FLAT[: len(FLAT) - frame // 2] + frame * SIZE, [("vertex", np.arange(len(FLAT) - frame // 2)[:, None])]).write(
+            tmp_path / "raw" / "a" / f"out_{frame}.vtu"
+        )
+    with pytest.raises(ImportFailure, match="particles must be the same in all frames"):
+        imported(tmp_path, frame_dt=DT, materials={0: "fluid"})
+
+
+def test_files_that_meshio_does_not_know(tmp_path: Path) -> None:
+    (tmp_path / "raw" / "a").mkdir(parents=True)
+    for frame in range(4):
+        (tmp_path / "raw" / "a" / f"out_{frame}.vtp").write_text("<VTKFile/>")
+    with pytest.raises(ImportFailure, match="save them as .vtu, or use format=arrays"):
+        imported(tmp_path, frame_dt=DT)
