@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from gpe_pl.benchmarks.faults.isolation import run
-from gpe_pl.benchmarks.faults.runs import Command
+from gpe_pl.benchmarks.faults.runs import Command, compared
 from gpe_pl.benchmarks.faults.verdict import Fault, Verdict
 from gpe_pl.errors import GpeError
 
@@ -69,8 +69,10 @@ def mutations(key: str, value: Any) -> Iterator[tuple[str, str, bool]]:
         yield "absurd value", f"{key}={text}", False
 
 
-def started(command: Command, override: str, must_fail: bool, limit: float, folder: Path) -> Verdict:
+def started(command: Command, override: str, must_fail: bool, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
     """Start a command with one additional override, and return the verdict.
+
+    If it may succeed and does, its results are compared with those without the override: ``harmless`` means equal, ``changed`` that the override had an effect.
 
     A command that makes data starts in an empty folder, because it refuses every other setting where data exist. One that reads data has a copy of them.
 
@@ -78,6 +80,7 @@ def started(command: Command, override: str, must_fail: bool, limit: float, fold
         command: the undisturbed command.
         override: the additional override.
         must_fail: whether the command has to refuse it.
+        expected: digests of the results, data included, without the override.
         limit: time [s] after which the command is stopped.
         folder: empty folder of its data and results.
     """
@@ -86,16 +89,20 @@ def started(command: Command, override: str, must_fail: bool, limit: float, fold
         command = replace(command, data=None)
     ended = run(command.module, [*command.given(folder), override], limit)
     verdict = ended.verdict("accepted" if must_fail else "harmless")
-    if verdict.status in ("refused", "harmless") and list(folder.rglob("*.part*")):
+    if verdict.status == "harmless":
+        verdict = compared(folder, expected, verdict.detail)
+        return Verdict("changed", verdict.detail) if verdict.status == "different" else verdict
+    if verdict.status == "refused" and list(folder.rglob("*.part*")):
         return Verdict("half-written", verdict.detail)
     return verdict
 
 
-def faults(command: Command, count: int, seed: int = 0, limit: float = 120.0) -> list[Fault]:
+def faults(command: Command, expected: dict[str, str], count: int, seed: int = 0, limit: float = 120.0) -> list[Fault]:
     """Return mutations of the configuration of a command.
 
     Args:
         command: the undisturbed command; some mutations change nothing, and it then runs to its end.
+        expected: digests of its results and data.
         count: number of mutations, divided equally among the kinds.
         seed: seed of their choice.
         limit: time [s] after which a command is stopped.
@@ -115,6 +122,6 @@ def faults(command: Command, count: int, seed: int = 0, limit: float = 120.0) ->
     for kind, every in by_kind.items():
         chosen = rng.permutation(len(every))[: math.ceil(count / len(by_kind))]
         for override, must_fail in (every[k] for k in sorted(chosen)):
-            attack = partial(started, command, override, must_fail, limit)
+            attack = partial(started, command, override, must_fail, expected, limit)
             found.append(Fault(f"configuration, {kind}", f"{command.module} {override}", attack, command.seconds))
     return found

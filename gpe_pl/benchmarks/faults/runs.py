@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from gpe_pl.benchmarks.faults import isolation, stores
-from gpe_pl.benchmarks.faults.verdict import MAX_DETAIL, Fault, Verdict
+from gpe_pl.benchmarks.faults.verdict import GOOD, MAX_DETAIL, Fault, Verdict
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.rollout_cost import COST_FILE
 from gpe_pl.learned.checkpoint_file import load_checkpoint
@@ -96,25 +96,29 @@ def digests(folder: Path) -> dict[str, str]:
     found = {}
     for path in _final_files(folder):
         relative = path.relative_to(folder)
-        name = str(relative)
-        if "log" in relative.parts or path.name == PROVENANCE or not path.is_file():
-            continue
-        if path.suffix == ".ckpt":
-            stored = load_checkpoint(path)
-            found[name] = _digest({key: stored[key] for key in SAVED})
-        elif path.name == MEASURED:
-            values = json.loads(path.read_text(encoding="utf-8"))
-            found[name] = _digest([values["settings"], len(values["records"])])
-        elif path.name == COST_FILE:
-            found[name] = _digest(sorted(json.loads(path.read_text(encoding="utf-8"))))
-        elif path.suffix == ".json":
-            values = json.loads(path.read_text(encoding="utf-8"))
-            found[name] = _digest({k: v for k, v in values.items() if k != "folder"} if path.name == "report.json" else values)
-        elif path.with_name(MEASURED).exists():
-            found[name] = "of what was measured"
-        elif path.suffix == ".h5" or path.name in ("metrics.csv", "table.csv", "table.md"):
-            found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        if "log" not in relative.parts and path.name != PROVENANCE and path.is_file() and (digest := _digest_of(path)) is not None:
+            found[str(relative)] = digest
     return found
+
+
+def _digest_of(path: Path) -> str | None:
+    """Return the digest of a file of results, or None for a file of no results."""
+    if path.suffix == ".ckpt":
+        stored = load_checkpoint(path)
+        return _digest({key: stored[key] for key in SAVED})
+    if path.name == MEASURED:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        return _digest([values["settings"], len(values["records"])])
+    if path.name == COST_FILE:
+        return _digest(sorted(json.loads(path.read_text(encoding="utf-8"))))
+    if path.suffix == ".json":
+        values = json.loads(path.read_text(encoding="utf-8"))
+        return _digest({k: v for k, v in values.items() if k != "folder"} if path.name == "report.json" else values)
+    if path.with_name(MEASURED).exists():
+        return "of what was measured"
+    if path.suffix == ".h5" or path.name in ("metrics.csv", "table.csv", "table.md"):
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    return None
 
 
 def _digest(value: Any) -> str:
@@ -171,7 +175,11 @@ def _final_files(folder: Path) -> list[Path]:
 
 def finished(command: Command, folder: Path, expected: dict[str, str], limit: float, stays: frozenset[str] = frozenset()) -> Verdict:
     """Run a command to its end, and compare its results with ``expected``. Files named in ``stays`` may be left over."""
-    ended = isolation.run(command.module, command.given(folder), limit)
+    return _judged(isolation.run(command.module, command.given(folder), limit), command, folder, expected, stays)
+
+
+def _judged(ended: isolation.Ended, command: Command, folder: Path, expected: dict[str, str], stays: frozenset[str]) -> Verdict:
+    """Return the verdict of a repeated command that has ended by itself: only one of ``ONCE`` may fail, and only if its results are those expected."""
     verdict = ended.verdict()
     may_be_done = command.module in ONCE and verdict.status == "refused"
     if ended.code != 0 and not may_be_done:
@@ -193,6 +201,8 @@ def compared(folder: Path, expected: dict[str, str], detail: str, stays: frozens
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 """Signals that end a command early."""
+ANSWER = 5.0
+"""Time [s] within which a command has to end after a signal. Miniature commands take less than a second, also on slow machines."""
 
 
 # --- kills --------------------------------------------------------------------------------------------------------------------------------
@@ -201,8 +211,10 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: int = 0, limit: float = 600.0) -> Iterator[Verdict]:
     """Kill a command at random moments, with SIGKILL, SIGTERM and SIGINT in turn, start it again, and after some kills let it finish.
 
-    The final results are compared with those of an undisturbed run. Yield a verdict for each of ``count`` kills, which names its time. A run is killed at most
-    ``in_a_row`` times before it may finish.
+    It has to end within ``ANSWER`` seconds of a signal, with an exit code other than 0 unless it had already written its results. A start that ends before its
+    kill has to succeed, or to refuse finished work (``ONCE``). The final results are compared with those of an undisturbed run.
+
+    Yield a verdict for each of ``count`` kills, which names its time. A run is killed at most ``in_a_row`` times before it may finish.
     """
     rng = np.random.default_rng(seed)
     whole = folder / "whole"
@@ -210,7 +222,8 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
     ended = isolation.run(command.module, command.given(whole), limit)
     duration = time.monotonic() - started
     if ended.code != 0:
-        yield ended.verdict()
+        verdict = ended.verdict()
+        yield Verdict("different", f"fails where nothing is wrong: {verdict.status}: {verdict.detail}")
         return
     expected, number = digests(whole), 0
     while number < count:
@@ -220,37 +233,46 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
         while len(moments) < min(in_a_row, count - number):
             kind = SIGNALS[(number + len(moments)) % len(SIGNALS)]
             moment = float(rng.uniform(0.0, duration))
-            process = isolation.start(command.module, command.given(own), folder / "output")
-            try:
-                if isolation.waited(process, moment):  # the command ended first, so start over
-                    if process.exitcode != 0:
-                        problem = (
-                            problem
-                            or isolation.Ended(
-                                process.exitcode, (folder / "output").read_text(encoding="utf-8", errors="replace")
-                            ).verdict()
-                        )
-                    if moments:
-                        break
+            found = _killed(command, own, folder / "output", kind, moment)
+            if isinstance(found, isolation.Ended):
+                if found.code == 0 and not moments:  # start over
                     duration *= 0.9
                     shutil.rmtree(own, ignore_errors=True)
                     continue
-                os.kill(process.pid, kind)
-                if not isolation.waited(process, min(limit, command.seconds + isolation.HANG)):
-                    problem = Verdict("hung", f"after {kind.name}")
-            finally:
-                isolation.end(process)
+                if found.code != 0:
+                    repeated = _judged(found, command, own, expected, released(own))
+                    problem = problem or (None if repeated.status in GOOD else repeated)
+                    moments = moments or ["not killed"]
+                break
             moments.append(f"{kind.name} after {moment:.2f} s")
-            output = (folder / "output").read_text(encoding="utf-8", errors="replace")
-            if kind is not signal.SIGKILL and (said := TRACEBACK.search(output)):
-                problem = problem or Verdict("traceback", " ".join(said.group().split())[-MAX_DETAIL:])
-            if broken := incomplete(own):
-                problem = problem or Verdict("half-written", "; ".join(broken))
+            problem = problem or found
         number += len(moments)
         verdict = problem or finished(command, own, expected, limit, released(own))
         for text in moments:
             yield Verdict(verdict.status, f"{text}; {verdict.detail}")
         shutil.rmtree(own, ignore_errors=True)
+
+
+def _killed(command: Command, own: Path, output: Path, kind: signal.Signals, moment: float) -> isolation.Ended | Verdict | None:
+    """Start a command, and send it a signal after a time [s]. Return its end if that came first, else what was wrong after the signal, or None."""
+    process = isolation.start(command.module, command.given(own), output)
+    try:
+        if isolation.waited(process, moment):
+            return isolation.Ended(process.exitcode, output.read_text(encoding="utf-8", errors="replace"))
+        sent = time.time()
+        os.kill(process.pid, kind)
+        if not isolation.waited(process, ANSWER):
+            return Verdict("hung", f"goes on for {ANSWER:g} s after {kind.name}")
+    finally:
+        isolation.end(process)
+    said = TRACEBACK.search(output.read_text(encoding="utf-8", errors="replace"))
+    if kind is not signal.SIGKILL and said:
+        return Verdict("traceback", " ".join(said.group().split())[-MAX_DETAIL:])
+    if broken := incomplete(own):
+        return Verdict("half-written", "; ".join(broken))
+    if process.exitcode == 0 and any((own / name).stat().st_mtime > sent for name in digests(own)):
+        return Verdict("hung", f"goes on to its end after {kind.name}")
+    return None
 
 
 # --- damaged files of a run ---------------------------------------------------------------------------------------------------------------
@@ -266,19 +288,29 @@ def _damaged_bytes(damage: Callable[[bytes], bytes], path: Path) -> None:
 
 
 def changed_file(command: Command, sound: Path, name: str, change: Callable[[Path], None], limit: float, folder: Path) -> Verdict:
-    """Change or replace the file ``name`` among the results of a command, and repeat the command, as in ``damaged_file``."""
+    """Change or replace the file ``name`` among the results of a command, and repeat the command, as in ``damaged_file``.
+
+    The verdict is ``unread`` if the command succeeds, leaves the file as it is, and readers refuse the file. All other results are compared.
+    """
     for part in sound.iterdir():
         (shutil.copytree if part.is_dir() else shutil.copy)(part, folder / part.name)
     change(folder / name)
     ended = isolation.run(command.module, command.given(folder), limit)
     if ended.code != 0:
         return ended.verdict()
-    try:
-        expected, found = digests(sound), digests(folder)
-        wrong = sorted(k for k in expected if found.get(k) != expected[k] and not _have_equal_content(sound / k, folder / k))
-    except GpeError as error:  # the command did not need the file; commands that need it are refused
-        return Verdict("refused", str(error)[:MAX_DETAIL])
-    return Verdict("accepted", f"no error, but {', '.join(wrong)} differ") if wrong else Verdict("harmless")
+    wrong, refused = [], ""
+    for relative, expected in digests(sound).items():
+        path = folder / relative
+        try:
+            is_equal = path.is_file() and (_digest_of(path) == expected or _have_equal_content(sound / relative, path))
+        except GpeError as error:
+            is_equal = relative == name or path.read_bytes() == (sound / relative).read_bytes()  # or refused because of the file beside it
+            refused = str(error)
+        if not is_equal:
+            wrong.append(relative)
+    if wrong:
+        return Verdict("accepted", f"no error, but {', '.join(sorted(wrong))} differ")
+    return Verdict("unread", f"not needed; readers say: {refused}"[:MAX_DETAIL]) if refused else Verdict("harmless")
 
 
 def _have_equal_content(sound: Path, damaged: Path) -> bool:

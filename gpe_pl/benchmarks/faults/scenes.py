@@ -20,9 +20,11 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard
-from gpe_pl.rollout.loop import rollout
+from gpe_pl.rollout.loop import Simulator, Start, frames, step_scenes
+from gpe_pl.trajectory.arrays import nearest_distances
+from gpe_pl.trajectory.boundary import as_numpy
 from gpe_pl.trajectory.state import State
-from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+from gpe_pl.trajectory.trajectory import Metadata, Termination
 
 NUM_STEPS = 3
 
@@ -44,14 +46,18 @@ def _changed(state: State, name: str, chosen: np.ndarray, value: Any) -> State:
 
 
 def _inside(state: State, rng: np.random.Generator) -> State:
-    """Move a third of the particles behind the surface of walls and obstacles."""
+    """Move a third of the particles behind the surface of obstacles, at most as deep as particles are apart."""
+    shapes = [shape for shape in state.boundary.shapes if shape.kind != "wall"]
+    on_obstacle = np.flatnonzero(np.min([np.abs(shape.signed_distance(state.boundary.pos)) for shape in shapes], axis=0) < 1e-6)
     chosen = rng.permutation(state.num_nodes)[: max(1, state.num_nodes // 3)]
-    wall = rng.integers(len(state.boundary.pos), size=len(chosen))
-    depth = rng.uniform(0.0, 0.2, (len(chosen), 1))
-    return _changed(state, "pos", chosen, state.boundary.pos[wall] - depth * state.boundary.normal[wall])
+    node = rng.choice(on_obstacle, size=len(chosen))
+    spacing = float(np.median(nearest_distances(state.pos)))
+    depth = spacing * rng.uniform(0.0, 1.0, (len(chosen), 1))
+    return _changed(state, "pos", chosen, state.boundary.pos[node] - depth * state.boundary.normal[node])
 
 
 Change = Callable[[State, np.random.Generator], State]
+INSIDE = "particles inside obstacles"
 
 CHANGES: dict[str, Change] = {
     "no particle": lambda s, rng: s.take(np.empty(0, np.int64)),
@@ -60,7 +66,7 @@ CHANGES: dict[str, Change] = {
     "overlapping bodies": lambda s, rng: twice(s, rng.normal(scale=1e-3, size=s.dim)),
     "bodies in one place": lambda s, rng: twice(s, np.zeros(s.dim)),
     "all particles in one place": lambda s, rng: replace(s, pos=np.broadcast_to(s.pos[:1], s.pos.shape).copy()),
-    "particles inside obstacles": _inside,
+    INSIDE: _inside,
     "a particle outside the domain": lambda s, rng: _changed(s, "pos", rng.integers(s.num_nodes, size=1), 10.0),
     "a position not finite": lambda s, rng: _changed(s, "pos", rng.integers(s.num_nodes, size=1), rng.choice([np.nan, np.inf])),
     "a velocity not finite": lambda s, rng: _changed(s, "vel", rng.integers(s.num_nodes, size=1), rng.choice([np.nan, -np.inf])),
@@ -79,25 +85,44 @@ WRONG = {
     "an impossible material parameter",
 }
 """Changes that have no sound result."""
+STEPPED = {"all particles in one place", INSIDE, "a particle outside the domain", "a velocity of 1e6 m/s"}
+"""Changes that a guard would reject before the first step. It checks only the states after it, so that the solver or model has to step."""
 
 
 def simulated(spec: DatasetSpec, name: str, learned: bool, seed: int, folder: Path) -> Verdict:
     """Run some steps of a scene with the change ``name``, by the data set's solver or, if ``learned``, by a model with random weights. Return the verdict."""
-    state = CHANGES[name](initial_state(spec, "test", seed % spec.counts["test"]), np.random.default_rng(seed))
+    state = CHANGES[name](_scene(spec, seed, name == INSIDE), np.random.default_rng(seed))
     metadata = trajectory_metadata(spec, "test", 0)
-    return verdict_of(lambda: _rolled_out(spec, state, metadata, learned), lambda result: name not in WRONG and _is_finite(result))
+    return verdict_of(
+        lambda: _rolled_out(spec, state, metadata, learned, name in STEPPED),
+        lambda states: name not in WRONG and all(map(_is_finite, states)),
+    )
 
 
-def _rolled_out(spec: DatasetSpec, state: State, metadata: Metadata, learned: bool) -> Trajectory:
-    guard = Guard(max_speed=1e4, bounds=metadata.bounds, margin=0.1, spacing=metadata.spacing)
-    if not learned:
-        result = rollout(spec.solver, state, NUM_STEPS, metadata, guard)
+def _scene(spec: DatasetSpec, seed: int, has_obstacle: bool) -> State:
+    """Return the start of a test scene, the first from number ``seed`` on that has an obstacle if it needs one."""
+    count = spec.counts["test"]
+    starts = (initial_state(spec, "test", (seed + k) % count) for k in range(count))
+    return next(s for s in starts if not has_obstacle or any(shape.kind != "wall" for shape in s.boundary.shapes))
+
+
+def _rolled_out(spec: DatasetSpec, state: State, metadata: Metadata, learned: bool, must_step: bool) -> list[State]:
+    """Return the states after each step. The limits and containment are those of rollouts of users (``scenes.rollouts.predicted``)."""
+    guard = Guard(bounds=metadata.bounds, margin=metadata.longest_side, spacing=metadata.spacing)
+    simulator: Simulator = spec.solver
+    if learned:
+        model = small_model(metadata)
+        simulator, state = Contained(model, metadata.frame_dt), model.standing(state, metadata)
+    if must_step:
+        items = step_scenes(simulator, {0: state}, {0: NUM_STEPS}, {0: guard.of(state)})
     else:
-        simulator = small_model(metadata)
-        result = rollout(Contained(simulator, metadata.frame_dt), simulator.standing(state, metadata), NUM_STEPS, metadata, guard)
-    if result.termination is not None:
-        raise Stopped(f"{result.termination.reason}: {result.termination.message}")
-    return result
+        items = frames(simulator, [Start(state, NUM_STEPS, metadata, guard)])
+    states = []
+    for _, _, item in items:
+        if isinstance(item, Termination):
+            raise Stopped(f"{item.reason}: {item.message}")
+        states.append(item)
+    return states
 
 
 def small_model(metadata: Metadata) -> LearnedSimulator:
@@ -107,8 +132,8 @@ def small_model(metadata: Metadata) -> LearnedSimulator:
     return LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=8), build).eval()
 
 
-def _is_finite(result: Trajectory) -> bool:
-    return bool(np.isfinite(result.pos).all() and np.isfinite(result.vel).all())
+def _is_finite(state: State) -> bool:
+    return bool(np.isfinite(as_numpy(state.pos)).all() and np.isfinite(as_numpy(state.vel)).all())
 
 
 def faults(specs: dict[str, DatasetSpec], num_seeds: int) -> list[Fault]:

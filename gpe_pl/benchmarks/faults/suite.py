@@ -187,15 +187,15 @@ def _faults(settings: Settings, specs: dict[str, DatasetSpec], commands: dict[st
         found += checkpoints.faults(saved[0], settings.num_file_damages, settings.seed)
     for name, command in commands.items():
         attacked, sound = settings.commands[name], root / name
+        left = runs.digests(sound)
+        both = left | runs.digests(root / next(iter(commands))) if command.data else left
         if attacked.num_configs:
-            found += configs.faults(command, attacked.num_configs, settings.seed, settings.limit)
+            found += configs.faults(command, both, attacked.num_configs, settings.seed, settings.limit)
         found += runs.damage_faults(command, sound, attacked.num_damages, settings.seed, settings.limit)
         found += side_files.command_faults(command, sound, attacked.num_contents, settings.seed, settings.limit)
         found += outside.faults(command, sound, attacked.names, attacked.leads_out, settings.limit)
-        left = runs.digests(sound)
         if attacked.num_pairs:
             found += pairs.pair_faults(_pairs(settings, name, commands, root), attacked.num_pairs, settings.seed, settings.limit)
-        both = left | runs.digests(root / next(iter(commands))) if command.data else left
         expected = {"data": both, "runs": left}
         for part in DELETED[attacked.module] if attacked.num_deletions else ():
             found += pairs.deletion_faults(command, part, expected[part], attacked.num_deletions, settings.seed, settings.limit)
@@ -244,7 +244,7 @@ def report(records: Sequence[dict[str, Any]]) -> str:
 
 
 def _table(records: Sequence[dict[str, Any]]) -> Iterator[str]:
-    statuses = [*GOOD, *(s for s in BAD if any(r["status"] == s for r in records))]
+    statuses = [s for s in (*GOOD, *BAD) if any(r["status"] == s for r in records)]
     yield table_row(["fault", "number", *statuses])
     yield "|" + "---|" * (2 + len(statuses))
     for kind in dict.fromkeys(r["kind"] for r in records):

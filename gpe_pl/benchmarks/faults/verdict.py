@@ -12,16 +12,18 @@ from gpe_pl.errors import GpeError
 Status = Literal[
     "refused",  # a typed, readable error
     "harmless",  # the result is the undisturbed one, or sound
+    "unread",  # the command did not read a damaged file that readers refuse, and its other results are the undisturbed ones
+    "changed",  # no error, and results that may differ, because a setting differs that may be given
     "accepted",  # no error, and a result that cannot be trusted
     "traceback",  # an error without a type that a user could act on
     "executed",  # a payload ran
     "outside",  # a file changed in a folder that does not belong to the command
     "half-written",  # an incomplete file has a final name
     "different",  # the resumed result differs from that of an undisturbed run
-    "hung",
+    "hung",  # takes too long, or goes on after a signal that ends commands
     "died",
 ]
-GOOD: tuple[Status, ...] = ("refused", "harmless")
+GOOD: tuple[Status, ...] = ("refused", "harmless", "unread", "changed")
 BAD: tuple[Status, ...] = ("accepted", "traceback", "executed", "outside", "half-written", "different", "hung", "died")
 
 T = TypeVar("T")

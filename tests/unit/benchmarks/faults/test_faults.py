@@ -9,11 +9,12 @@ import runpy
 import shutil
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import h5py
 import numpy as np
@@ -28,6 +29,7 @@ from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.errors import GpeError
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.rollout.loop import Simulator
 from gpe_pl.system import early_interrupts
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import read_trajectory, stored_arrays, write_shard
@@ -92,6 +94,31 @@ def test_impossible_scenes(spec: DatasetSpec, tmp_path: Path, learned: bool) -> 
     every = [f for f in scenes.faults({"sand": spec}, 1) if ("model" in f.name) is learned]
     assert {f.kind.removeprefix("scene, ") for f in every} == set(scenes.CHANGES)
     assert not bad(every, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("learned", [False, True], ids=["solver", "model"])
+@pytest.mark.parametrize("name", sorted(scenes.STEPPED))
+def test_scenes_that_a_guard_would_reject_are_stepped(
+    spec: DatasetSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, learned: bool
+) -> None:
+    steps, before = [], scenes.step_scenes
+
+    def counted(simulator: Simulator, *arguments: Any) -> Iterator[Any]:
+        def step(state: State) -> State:
+            steps.append(state)
+            return simulator.step(state)
+
+        return before(SimpleNamespace(step=step), *arguments)
+
+    monkeypatch.setattr(scenes, "step_scenes", counted)
+    assert scenes.simulated(spec, name, learned, 0, tmp_path).status in GOOD
+    assert steps
+    if name == scenes.INSIDE:
+        shapes = [shape for shape in steps[0].boundary.shapes if shape.kind != "wall"]
+        depth = -np.min([shape.signed_distance(np.asarray(steps[0].pos)) for shape in shapes], axis=0)
+        assert (depth > 1e-4).sum() >= steps[0].num_nodes // 4 and depth.max() < 1.2 * spec.scene.spacing
+        assert all((np.asarray(steps[0].pos)[:, k] > low - 1e-6).all() for k, (low, _) in enumerate(spec.scene.bounds))
 
 
 @pytest.mark.slow
@@ -252,12 +279,57 @@ def test_a_wrong_configuration_has_data_of_its_own(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(configs, "run", run)
     for command, found in ((runs.Command("one", "simulate", ()), []), (runs.Command("other", "fit", (), str(data)), ["dataset.json"])):
-        fault = configs.faults(command, 1)[0]
+        fault = configs.faults(command, {}, 1)[0]
         shutil.rmtree(own, ignore_errors=True)
         own.mkdir()
         fault.attack(own)
         assert {f"paths.data={own / 'data'}", f"paths.runs={own / 'runs'}"} <= set(given[-1])
         assert [path.name for path in own.glob("data/*")] == found
+
+
+@pytest.mark.parametrize(
+    ("found", "must_fail", "status"), [("1", False, "harmless"), ("2", False, "changed"), ("1", True, "accepted"), ("2", True, "accepted")]
+)
+def test_a_setting_is_harmless_if_results_are_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found: str, must_fail: bool, status: str
+) -> None:
+    monkeypatch.setattr(configs, "run", lambda *_: Ended(0, ""))
+    monkeypatch.setattr(runs, "digests", lambda _: {"a": found})
+    assert configs.started(runs.Command("one", "fit", ()), "~seed", must_fail, {"a": "1"}, 1.0, tmp_path).status == status
+
+
+@pytest.mark.parametrize(
+    ("left", "code", "status"),
+    [
+        ({}, 2, "refused"),
+        ({}, 0, "unread"),  # succeeds without the file
+        ({"best.ckpt": "sound"}, 0, "harmless"),  # writes it again
+        ({"table.md": "wrong"}, 0, "accepted"),  # and another result is wrong
+    ],
+)
+def test_a_damaged_file_that_no_command_reads_is_not_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: dict[str, str], code: int, status: str
+) -> None:
+    sound, own = tmp_path / "sound", tmp_path / "own"
+    (sound / "runs").mkdir(parents=True)
+    own.mkdir()
+    for name in ("best.ckpt", "table.md"):
+        (sound / "runs" / name).write_text("sound")
+
+    def run(*_: object) -> Ended:
+        for name, text in left.items():
+            (own / "runs" / name).write_text(text)
+        return Ended(code, "error: damaged" if code else "")
+
+    def load(path: Path) -> dict[str, str]:
+        if path.read_text() != "sound":
+            raise GpeError("best.ckpt: damaged")
+        return dict.fromkeys(runs.SAVED, "sound")
+
+    monkeypatch.setattr(isolation, "run", run)
+    monkeypatch.setattr(runs, "load_checkpoint", load)
+    command = runs.Command("one", "fit", ())
+    assert runs.damaged_file(command, sound, "runs/best.ckpt", lambda data: data[:2], 1.0, own).status == status
 
 
 def _finds(_: Path) -> Verdict:
@@ -392,6 +464,78 @@ def test_a_lock_of_a_killed_command_may_stay(tmp_path: Path, monkeypatch: pytest
     assert [verdict.status for verdict in runs.kills(COMMANDS[0], tmp_path, 1)] == [status]
 
 
+def _of_this_test(mode: str, folder: str, output: str) -> None:
+    """Play a command that takes 0.6 s and writes a table."""
+    with open(output, "wb", buffering=0) as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN if mode == "ignores signals" else signal.SIG_DFL)
+    table = Path(folder) / "runs" / "table.md"
+    if mode == "refuses to resume" and table.parent.exists():
+        os.write(1, b"error: runs: remains of another command\n")
+        os._exit(1)
+    if mode == "wrong and done" and table.exists():
+        os.write(1, b"error: runs: exists already\n")
+        os._exit(1)
+    table.parent.mkdir(parents=True, exist_ok=True)
+    if mode == "wrong and done":
+        table.write_text("right" if Path(folder).name == "whole" else "wrong")
+    time.sleep(0.6)
+    if mode != "wrong and done":
+        table.write_text("right")
+    os._exit(0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mode", "module", "status"),
+    [
+        ("resumes", "fit", "harmless"),
+        ("refuses to resume", "fit", "different"),
+        ("wrong and done", "convert", "different"),
+        ("ignores signals", "fit", "hung"),
+    ],
+)
+def test_kills_notice_commands_that_neither_end_nor_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str, module: str, status: str
+) -> None:
+    context = multiprocessing.get_context("fork")
+
+    def start(_: str, given: list[str], output: Path, __: object = None) -> Any:
+        output.touch()
+        folder = next(Path(text.removeprefix("paths.runs=")).parent for text in given if text.startswith("paths.runs="))
+        process = context.Process(target=_of_this_test, args=(mode, str(folder), str(output)))
+        process.start()
+        return process
+
+    monkeypatch.setattr(isolation, "start", start)
+    found = list(runs.kills(runs.Command("one", module, (), seconds=0.6), tmp_path, 6, in_a_row=3, seed=0))
+    statuses = {verdict.status for verdict in found}
+    assert status in statuses and statuses <= {"harmless", status}, found
+
+
+def test_a_command_that_does_not_end_after_a_signal_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[float] = []
+
+    class Runs(Ends):
+        pid = 0
+
+    monkeypatch.setattr(isolation, "start", lambda *_: Runs(0))
+    monkeypatch.setattr(isolation, "waited", lambda _, seconds: bool(waits.append(seconds)))
+    monkeypatch.setattr(os, "kill", lambda *_: None)
+    verdict = runs._killed(COMMANDS[0], tmp_path, tmp_path / "output", signal.SIGTERM, 0.3)
+    assert verdict == Verdict("hung", "goes on for 5 s after SIGTERM") and waits == [0.3, runs.ANSWER]
+
+
+@pytest.mark.parametrize("ended", [Ended(2, "error: no room"), Ended(0, "")])
+def test_a_command_that_fails_undisturbed_cannot_be_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ended: Ended) -> None:
+    """Neither at all, nor in another folder than the first."""
+    monkeypatch.setattr(isolation, "run", lambda *_: ended)
+    monkeypatch.setattr(isolation, "start", lambda _, __, output: output.write_text("error: no room") and Ends(2))
+    assert {verdict.status for verdict in runs.kills(COMMANDS[0], tmp_path, 2)} == {"different"}
+
+
 @pytest.mark.parametrize(
     ("module", "found", "said", "status"),
     [
@@ -516,6 +660,7 @@ def test_the_matrix_counts_and_shows_what_is_bad() -> None:
         {"kind": "fit killed", "fault": "", "status": status, "detail": "SIGKILL after 1 s"}
         for status in ("harmless", "harmless", "different")
     ]
+    assert "| fault | number | refused | harmless | unread |" in report([*records[:3], *records[-2:], {**records[0], "status": "unread"}])
     text = report(records)
     assert text.startswith(
         "5 corrupted or hostile inputs: 0 tracebacks without a typed error, 1 silent acceptances, 0 executed payloads, "
