@@ -93,15 +93,14 @@ def server(folder: Path, port: int) -> ThreadingHTTPServer:
         raise PortFault(f"port={port}: {error.strerror}; choose another one, or port=0 for any free one") from None
 
 
-def _serve(folder: Path, port: int, is_opened: bool) -> None:
+def _serve(serving: ThreadingHTTPServer, is_opened: bool) -> None:
     from gpe_pl.viz.browser import open_address
 
-    with server(folder, port) as serving:
-        address = f"http://127.0.0.1:{serving.server_address[1]}/"
-        print(f"{address} (Ctrl-C ends)", flush=True)
-        if is_opened and not open_address(address):
-            print("no browser here; write the page with folder=… and open its index.html elsewhere", flush=True)
-        serving.serve_forever()
+    address = f"http://127.0.0.1:{serving.server_address[1]}/"
+    print(f"{address} (Ctrl-C ends)", flush=True)
+    if is_opened and not open_address(address):
+        print("no browser here; write the page with folder=… and open its index.html elsewhere", flush=True)
+    serving.serve_forever()
 
 
 def run(model: str | None, values: dict[str, Any]) -> None:
@@ -116,9 +115,9 @@ def run(model: str | None, values: dict[str, Any]) -> None:
     if "folder" in values:
         print(write(values["folder"], models, num_films))
         return
-    with tempfile.TemporaryDirectory(prefix="gpe_pl_") as folder:
+    with tempfile.TemporaryDirectory(prefix="gpe_pl_") as folder, server(Path(folder), values.get("port", 8000)) as serving:
         write(Path(folder), models, num_films)
-        _serve(Path(folder), values.get("port", 8000), values.get("open", True))
+        _serve(serving, values.get("open", True))
 
 
 main = command(run, ABOUT, "model", KEYS)

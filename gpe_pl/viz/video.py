@@ -1,5 +1,6 @@
 """Animations of a rollout beside the ground truth: GIF, or MP4 if imageio-ffmpeg is installed."""
 
+import math
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
@@ -28,6 +29,8 @@ DPI = 100
 BAR_PIXELS, BAR_WIDTH = 44, 240
 """Height of the scale of colours with its numbers and label, and width of the scale, in pixels."""
 
+SLOWEST = 0.01
+"""Lowest frame rate of an animation [frames/s]. A GIF can show a frame for at most some minutes."""
 SAMPLES = 8
 """Number of frames whose colours determine the palette of a GIF."""
 BYTES = np.array([1 << 16, 1 << 8, 1])
@@ -58,8 +61,8 @@ def write_animation(
             in ``Coloring``.
 
     Raises:
-        ValueError: the file type is unknown, the stride or frame rate is not positive, a GIF has more than 50 frames per second, no trajectory
-            has the values for ``color``, or a prediction has the name of the first panel.
+        ValueError: the file type is unknown, the stride is not positive, the frame rate is below ``SLOWEST``, a GIF has more than 50 frames per second, no
+            trajectory has the values for ``color``, or a prediction has the name of the first panel.
         FilmError: ffmpeg could not write the whole MP4.
         FullDiskError: there is no room for a GIF.
         ModuleNotFoundError: MP4 without imageio-ffmpeg.
@@ -87,8 +90,10 @@ def _write(
 ) -> None:
     if path.suffix not in (".gif", ".mp4"):
         raise ValueError(f"{path}: an animation ends in .gif or .mp4")
-    if len(frames) == 0 or fps <= 0:
-        raise ValueError(f"{path}: stride and fps must be positive, and there must be a frame to show")
+    if len(frames) == 0:
+        raise ValueError(f"{path}: stride must be positive, and there must be a frame to show")
+    if not SLOWEST <= fps < math.inf:  # NaN fails all comparisons
+        raise ValueError(f"{path}: fps={fps}: must be a number of at least {SLOWEST}")
     with replacing(path) as part:
         coloring = Coloring(color, list(rows.values()), frames, truth)
         images = _images(rows, frames, coloring, panel_pixels)

@@ -279,3 +279,9 @@ def test_the_command_refuses_in_one_line(
 def test_a_port_in_use_is_refused(tmp_path: Path) -> None:
     with play.server(tmp_path, 0) as first, pytest.raises(play.PortFault, match="port=0 for any free one"):
         play.server(tmp_path, first.server_address[1])
+
+
+def test_a_port_in_use_is_refused_before_the_page_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(play, "write", lambda *_: pytest.fail("the page was made"))
+    with play.server(tmp_path, 0) as first, pytest.raises(play.PortFault):
+        play.run("sand", {"port": first.server_address[1], "open": False})

@@ -223,3 +223,19 @@ def test_pages_refuse_what_they_would_compute_otherwise() -> None:
     for change in ({"gravity": (0.0, -1.62)}, {"bounds": ((0.0, 2.0), (0.0, 1.0))}):
         with pytest.raises(PageError, match=f"the scene has {next(iter(change))}="):
             check_film(own, replace(film, metadata=replace(own, **change)))  # type: ignore[arg-type]
+
+
+def test_removing_counts_only_if_something_is_removed() -> None:
+    """A scene whose particles are all gone has no edges."""
+    script = f"""
+const {{ World }} = await import("{PARTS}/world.mjs");
+const world = Object.create(World.prototype), numbers = (...values) => new Float64Array(values);
+const model = {{ history: 0, parameters: [], spacing: 0.02, bounds: [[0, 1], [0, 1]] }};
+const state = {{ count: 1, pos: numbers(0.5, 0.5), vel: numbers(0, 0), mass: numbers(1), block: numbers(0), history: numbers(), params: numbers() }};
+const wall = {{ kind: "sphere", center: [0.8, 0.8], radius: 0.3 }};
+Object.assign(world, {{ model, state, unit: 1, shapes: [wall], numBlocks: 1, untouched: true, last: {{ edges: 7 }} }});
+const found = [world.removeAt(0.1, 0.1), world.addBlock(0.8, 0.8, 0.02), world.untouched, world.removeAt(0.5, 0.5), world.untouched, world.last.edges];
+console.log(JSON.stringify(found));
+"""
+    ran = subprocess.run([str(NODE), "--input-type=module", "-e", script], capture_output=True, text=True, check=True)
+    assert json.loads(ran.stdout) == ["", 0, True, "block", False, 0]

@@ -11,6 +11,7 @@ const FOLLOWS_IN = 0.04; // time in which the hand follows the pointer [s]
 const MOST_NODES = 1500;
 const RADIUS = 0.09, NEAR = 0.05, MARGIN = 0.02; // of a new obstacle; of the node that is picked; of obstacles from walls [m]
 const JITTER = 0.25; // of new blocks [spacings]
+const NOTHING = { corrected: 0, edges: 0, islands: 0 }; // what a step without particles does
 const EXPLODED = 50; // speed at which the model has failed [m/s]
 const OBSTACLE_FRICTION = 0.4;
 
@@ -31,7 +32,7 @@ export class World {
   reset(scene = this.scene || null) {
     const { model } = this;
     this.scene = scene;
-    Object.assign(this, { time: 0, hand: null, problem: "", untouched: Boolean(scene), last: { corrected: 0, edges: 0, islands: 0 } });
+    Object.assign(this, { time: 0, hand: null, problem: "", untouched: Boolean(scene), last: NOTHING });
     this.state = { count: 0, pos: new Float64Array(0), vel: new Float64Array(0), mass: new Float64Array(0), block: new Float64Array(0) };
     this.state.history = new Float64Array(0);
     this.state.params = new Float64Array(0);
@@ -83,6 +84,7 @@ export class World {
       state[name] = kept;
     }
     state.count = rows.length;
+    if (!state.count) this.last = NOTHING;
     this.hand = null;
   }
 
@@ -108,6 +110,7 @@ export class World {
       }
     }
     const count = pos.length / 2;
+    if (!count) return 0;
     const params = Array(count).fill(this.parameters).flat();
     this.append(count, { pos, mass: new Float64Array(count).fill(model.nodeMass), params });
     this.untouched = false;
@@ -124,15 +127,16 @@ export class World {
 
   /** Remove the obstacle at a point, or the block of the nearest node. Return what was removed. */
   removeAt(x, y) {
-    this.untouched = false;
     const obstacle = this.obstacleAt(x, y);
     if (obstacle) {
+      this.untouched = false;
       this.shapes = this.shapes.filter((shape) => shape !== obstacle);
       this.resample();
       return "obstacle";
     }
     const node = this.nodeAt(x, y);
     if (node < 0) return "";
+    this.untouched = false;
     const block = this.state.block[node];
     this.keep((n) => this.state.block[n] !== block);
     return "block";

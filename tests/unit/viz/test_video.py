@@ -1,3 +1,4 @@
+import math
 import sys
 from dataclasses import replace
 
@@ -119,7 +120,15 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path, ground_truth, 
 
 @pytest.mark.parametrize(
     ("name", "options", "message"),
-    [("a.avi", {}, "gif or .mp4"), ("a.gif", {"stride": 0}, "stride"), ("a.gif", {"fps": 0}, "fps"), ("a.gif", {"fps": 60}, "50 frames")],
+    [
+        ("a.avi", {}, "gif or .mp4"),
+        ("a.gif", {"stride": 0}, "stride"),
+        ("a.gif", {"fps": 0}, "fps=0: must"),
+        ("a.gif", {"fps": 60}, "50 frames"),
+        ("a.gif", {"fps": math.nan}, "fps=nan: must"),
+        ("a.gif", {"fps": 0.001}, "fps=0.001: must"),
+        ("a.mp4", {"fps": math.inf}, "fps=inf: must"),
+    ],
 )
 def test_senseless_requests_are_refused(tmp_path, ground_truth, name, options, message):
     with pytest.raises(ValueError, match=message):
