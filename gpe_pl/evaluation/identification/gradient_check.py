@@ -12,6 +12,10 @@ STEP = 0.05
 """Step of the central difference, as a fraction of the range between the bounds. With smaller steps, jumps decide that come from neighbours found or lost."""
 LARGEST_RATIO = 2.0
 """Gradient and finite difference may differ by this factor."""
+SMALL = 0.1
+"""Slopes along an unknown below this fraction of the largest slope hardly turn the search, and jumps decide their finite differences."""
+ONE_BY_ONE = 6
+"""Largest number of unknowns that are checked one by one, with two rollouts each. With more, one diagonal direction is checked."""
 
 
 @runtime_checkable
@@ -35,39 +39,45 @@ class Objective(Protocol):
 
 @dataclass(frozen=True)
 class GradientCheck:
-    """Derivative of the misfit along one direction, per range between the bounds.
+    """Derivatives of the misfit along some directions, per range between the bounds.
 
     Attributes:
-        gradient: derivative by automatic differentiation.
-        difference: central difference.
+        gradient: derivatives by automatic differentiation [direction].
+        difference: central differences [direction].
     """
 
-    gradient: float
-    difference: float
+    gradient: tuple[float, ...]
+    difference: tuple[float, ...]
 
     @property
     def is_trusted(self) -> bool:
-        """Whether both have the same sign, and differ by at most the factor ``LARGEST_RATIO``."""
-        if not np.isfinite(self.gradient) or self.gradient * self.difference <= 0:
+        """Whether both have the same sign, and differ by at most the factor ``LARGEST_RATIO``. Slopes below ``SMALL`` only have to be small in both."""
+        gradient, difference = np.array(self.gradient), np.array(self.difference)
+        if not np.isfinite(gradient).all() or not difference.any():
             return False
-        return 1 / LARGEST_RATIO <= self.gradient / self.difference <= LARGEST_RATIO
+        small = SMALL * np.abs(difference).max()
+        ratio = gradient / np.where(difference == 0, np.nan, difference)
+        agree = (ratio >= 1 / LARGEST_RATIO) & (ratio <= LARGEST_RATIO)
+        return bool((agree | (np.maximum(np.abs(gradient), np.abs(difference)) <= small)).all())
 
     def __str__(self) -> str:
-        if np.isnan(self.gradient):
+        if np.isnan(self.gradient).any():
             return "gradients cannot be trusted: the model has none here; a derivative-free search takes their place"
-        numbers = f"{self.gradient:.3g} by automatic differentiation, {self.difference:.3g} by finite differences"
+        slopes, by_differences = (" / ".join(f"{value:.3g}" for value in values) for values in (self.gradient, self.difference))
+        numbers = f"{slopes} by automatic differentiation, {by_differences} by finite differences"
         if self.is_trusted:
             return f"gradients are trusted: the slope of the misfit is {numbers}"
         return f"gradients cannot be trusted: the slope of the misfit is {numbers}; a derivative-free search takes their place, or choose a shorter horizon"
 
 
 def gradient_check(objective: Objective, z: Sequence[float] | np.ndarray, seed: int = 0) -> GradientCheck:
-    """Compare the gradient at numbers from 0 to 1 [unknown] with a central difference along a random diagonal direction.
+    """Compare the gradient at numbers from 0 to 1 [unknown] with central differences: along each unknown, or along a random diagonal if there are many.
 
     Away from the minimum the slope is large compared with rounding, so call it there.
     """
     center = np.clip(np.asarray(z, dtype=np.float64), STEP, 1 - STEP)
-    direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(center)) if len(center) > 1 else np.ones(1)
+    number = len(center)
+    directions = np.eye(number) if number <= ONE_BY_ONE else np.random.default_rng(seed).choice([-1.0, 1.0], size=(1, number))
     _, gradient = objective.misfit_and_gradient(center)
-    before, after = (objective.misfit(center + sign * STEP * direction) for sign in (-1, 1))
-    return GradientCheck(float(gradient @ direction), (after - before) / (2 * STEP))
+    differences = [(objective.misfit(center + STEP * way) - objective.misfit(center - STEP * way)) / (2 * STEP) for way in directions]
+    return GradientCheck(tuple((directions @ gradient).tolist()), tuple(differences))
