@@ -56,8 +56,8 @@ class Design:
     Attributes:
         scene: the scene with the obstacle at the best pose. A box has become the polygon with its outline, also at the start.
         pose: shift [m] and angle [rad]; zeros if no other pose that was tried is better.
-        distances: root mean square distance of nodes from the target [m] of the search's rollouts, by ``model`` and ``solver``, at the start and at the best
-            pose.
+        distances: root mean square distance of nodes from the target [m] by ``model`` and ``solver``, at the start and at the best pose. It is that of rollouts
+            with limits and, for the model, containment, as in predictions; NaN if one stopped early. The search has neither.
         rollouts: rollouts at the best pose, by name.
         method: ``gradient`` or ``derivative_free``.
         check: what a check of the gradient by finite differences found; empty without gradients.
@@ -87,9 +87,14 @@ class Design:
             f"{name}: distance from the target {_in_metres(after)}, {_in_metres(before)} at the start"
             for name, (before, after) in self.distances.items()
         ]
+        lines += [
+            f"{name} stopped at the best pose: {stop.reason}: {stop.message}"
+            for name, own in self.rollouts.items()
+            if (stop := own.termination)
+        ]
         if len(self.distances) == 2:
             promised, kept = (before - after for before, after in self.distances.values())
-            if promised > 0 and not math.isnan(kept):
+            if promised > 0 and not math.isnan(kept):  # false for NaN
                 lines.append(f"the solver keeps {100 * kept / promised:.0f} % of the improvement that the model promises")
         way = self.method.replace("_", "-")
         lines.append(
@@ -139,16 +144,22 @@ def design(
         PoseError: the obstacle cannot be moved, or touches other parts of the scene within the limits.
     """
     from gpe_pl.evaluation.design.guidance import Guidance
-    from gpe_pl.evaluation.design.pose import Obstacle, movable
+    from gpe_pl.evaluation.design.pose import TOUCHES, Obstacle, PoseError, movable
     from gpe_pl.evaluation.identification.search import SearchSettings, search
-    from gpe_pl.geometry.shapes import Sphere
+    from gpe_pl.geometry.shapes import Box, Polygon, Sphere
 
     _check(scene, target, obstacle, shift, angle, seconds, method, evaluations)
-    name, shape = scene.obstacles[obstacle - 1][0], movable(scene.obstacles[obstacle - 1][1])
+    name, given = scene.obstacles[obstacle - 1]
+    if not isinstance(given, Sphere | Box | Polygon):
+        raise DesignFault(f"obstacle={obstacle}: discs, boxes and polygons can be moved, not meshes and other shapes")
+    shape = movable(given)
     scene = _with_obstacle(scene, name, shape)
     simulator = scene.model_for(model or scene.shipped())
     state, metadata = scene.state(simulator)
-    moves = Obstacle.of(shape, state.boundary)
+    number = next((k for k, own in enumerate(state.boundary.shapes) if own is shape), None)
+    if number is None:  # one polygon with an obstacle that it touches
+        raise PoseError(TOUCHES)
+    moves = Obstacle.of(number, state.boundary)
     limits = (shift, shift, 0.0 if isinstance(shape, Sphere) else math.radians(angle))
     if not any(limits):
         raise DesignFault(f"shift=0: {name} is a disc, which does not turn; give a shift of more than 0")
@@ -163,16 +174,15 @@ def design(
             f"every rollout failed, with all {len(found.tried)} poses that were tried; check the scene, and shorten seconds={seconds}"
         )
     spent, is_better = time.process_time() - began, found.misfit < before - LEAST_GAIN
-    best, after = (tuple(guidance.pose(found.z).tolist()), found.misfit) if is_better else ((0.0, 0.0, 0.0), before)
+    best = tuple(guidance.pose(found.z).tolist()) if is_better else (0.0, 0.0, 0.0)
     moved = _with_obstacle(scene, name, moves.moved_shape(best)) if is_better else scene
-    failed = math.log(guidance.failed)
-    distances = {"model": (math.nan if before >= failed else math.exp(before / 2), math.exp(after / 2))}
-    rollouts, at_best = {}, moved.state(simulator)[0]
+    starts = (state, moved.state(simulator)[0]) if is_better else (state,)
+    made = {}
     if solver is not None:
-        pair = [solved(solver, s, metadata, num_frames, f"solver {solver.name}") for s in (state, at_best)]
-        before_it, after_it = (_distance(own, goal) for own in pair)
-        distances["solver"], rollouts["solver"] = (before_it, after_it), pair[1]
-    rollouts["model"] = predicted(simulator, at_best, metadata, num_frames, "model")
+        made["solver"] = [solved(solver, s, metadata, num_frames, f"solver {solver.name}") for s in starts]
+    made["model"] = [predicted(simulator, s, metadata, num_frames, "model") for s in starts]
+    rollouts = {key: own[-1] for key, own in made.items()}
+    distances = {key: (_distance(made[key][0], goal), _distance(made[key][-1], goal)) for key in ("model", "solver") if key in made}
     check = "" if found.check is None or not is_better else str(found.check)
     return Design(moved, best, distances, rollouts, found.method, check, guidance.num_evaluations, guidance.num_gradients, spent)
 

@@ -13,14 +13,14 @@ import pytest
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.shapes import Box, Polygon
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.rollout.loop import rollout
 from gpe_pl.scenes import design as verb
 from gpe_pl.scenes.design import Design, design
-from gpe_pl.scenes.obstacles import Circle
+from gpe_pl.scenes.obstacles import Circle, MeshObstacle
 from gpe_pl.scenes.scene import Scene
 from gpe_pl.trajectory.trajectory import Termination
 
 RAMP = Polygon(((0.30, 0.35), (0.34, 0.35), (0.34, 0.55), (0.30, 0.55)), 0.3)
+MESH = (("obstacle 1", MeshObstacle(Path("a.stl"), None, None, "z", 0.4)),)
 FILE = """
 box: [1.0, 1.0]
 bodies:
@@ -42,6 +42,9 @@ def scene(shape: Any = RAMP) -> Scene:
         (lambda: design(scene(), (0.8, 0.1), shift=0.0, angle=0.0), "shift=0.0 angle=0.0: must be at least 0, the angle at most 180, and not both 0"),
         (lambda: design(scene(), (0.8, 0.1), shift=0.4), "the obstacle touches"),
         (lambda: design(scene(), (0.8, 0.1), seconds=0.0), "seconds=0.0: must be more than 0"),
+        (lambda: design(scene().obstacle(RAMP), (0.8, 0.1)), "obstacle: it touches a wall or another obstacle"),
+        (lambda: design(scene(Circle((0.6, 0.3), 0.1)).obstacle(Circle((0.6, 0.3), 0.1)), (0.8, 0.1)), "obstacle: it touches a wall or another obstacle"),
+        (lambda: design(replace(scene(), obstacles=MESH), (0.8, 0.1)), "obstacle=1: discs, boxes and polygons can be moved"),
         (lambda: design(scene(Circle((0.5, 0.05), 0.1)), (0.8, 0.1)), "obstacle: it touches a wall or another obstacle"),
         (lambda: design(scene(Circle((0.6, 0.3), 0.1)), (0.8, 0.1), shift=0.0), "shift=0: obstacle 1 is a disc, which does not turn"),
         (lambda: verb.run("scene.yaml", {"target": (0.8, 0.1), "file": Path(__file__) / "a.html"}), "is a file and no folder; name another file"),
@@ -94,18 +97,27 @@ def test_the_distance_of_a_box_is_that_of_the_scene_that_is_returned(shift: floa
     seconds, goal, plate = 0.02, np.array([0.8, 0.1]), Box((0.30, 0.45), (0.34, 0.55), 0.3)
     above = Scene(box=(1.0, 1.0)).block("sand", at=(0.28, 0.58), size=(0.06, 0.04), velocity=(0.0, -2.0)).obstacle(plate)
     found = design(above, (0.8, 0.1), shift=shift, angle=angle, seconds=seconds, method="derivative_free", evaluations=1, solve=False)
-    simulator = LearnedSimulator.from_checkpoint("sand")
 
     def distance(scene: Scene) -> float:
-        state, metadata = scene.state(simulator)
-        start = simulator.standing(state, metadata)
-        return verb._distance(rollout(simulator, start, round(seconds / metadata.frame_dt), metadata), goal)
+        return verb._distance(scene.predict("sand", seconds).first, goal)
 
     assert any(found.pose)
     (moved,) = [shape for _, shape in found.scene.obstacles]
     start = Polygon(((0.30, 0.45), (0.34, 0.45), (0.34, 0.55), (0.30, 0.55)), 0.3)
     scenes = [replace(found.scene, obstacles=(("obstacle 1", shape),)) for shape in (start, moved)]
     assert found.distances["model"] == pytest.approx([*map(distance, scenes)], rel=1e-7)
+
+
+@pytest.mark.slow
+def test_the_distance_of_the_model_is_that_of_a_contained_rollout() -> None:
+    """Fast sand passes a thin plate in the rollouts of the search. The model's own rollout at the best pose stops, so that it has no distance."""
+    plate = Polygon(((0.28, 0.40), (0.48, 0.40), (0.48, 0.42), (0.28, 0.42)), 0.4)
+    fast = Scene(box=(1.0, 1.0)).block("sand", at=(0.3, 0.5), size=(0.1, 0.1), friction_angle=30, velocity=(0.0, -8.0)).obstacle(plate)
+    found = design(fast, (0.7, 0.05), shift=0.02, angle=5.0, seconds=0.1, method="derivative_free", evaluations=3, solve=False)
+    stop = found.rollouts["model"].termination
+    assert stop is not None and np.isnan(found.distances["model"][1])
+    assert "model: distance from the target not known, as the rollout stopped early" in found.summary()
+    assert f"model stopped at the best pose: {stop.reason}: {stop.message}" in found.summary()
 
 
 @pytest.mark.slow
