@@ -177,12 +177,12 @@ def design(
     best = tuple(guidance.pose(found.z).tolist()) if is_better else (0.0, 0.0, 0.0)
     moved = _with_obstacle(scene, name, moves.moved_shape(best)) if is_better else scene
     starts = (state, moved.state(simulator)[0]) if is_better else (state,)
-    made = {}
+    made: dict[str, list[Trajectory]] = {}
     if solver is not None:
         made["solver"] = [solved(solver, s, metadata, num_frames, f"solver {solver.name}") for s in starts]
     made["model"] = [predicted(simulator, s, metadata, num_frames, "model") for s in starts]
     rollouts = {key: own[-1] for key, own in made.items()}
-    distances = {key: (_distance(made[key][0], goal), _distance(made[key][-1], goal)) for key in ("model", "solver") if key in made}
+    distances = {key: (_distance(own[0], goal), _distance(own[-1], goal)) for key, own in reversed(made.items())}  # the model first
     check = "" if found.check is None or not is_better else str(found.check)
     return Design(moved, best, distances, rollouts, found.method, check, guidance.num_evaluations, guidance.num_gradients, spent)
 
