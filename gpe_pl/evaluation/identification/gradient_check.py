@@ -11,9 +11,9 @@ import numpy as np
 STEP = 0.05
 """Step of the central difference, as a fraction of the range between the bounds. With smaller steps, jumps decide that come from neighbours found or lost."""
 LARGEST_RATIO = 2.0
-"""Gradient and finite difference may differ by this factor."""
-SMALL = 0.1
-"""Slopes along an unknown below this fraction of the largest slope hardly turn the search, and jumps decide their finite differences."""
+"""Lengths of gradient and finite differences may differ by this factor."""
+LEAST_COSINE = 0.7
+"""Least cosine of the angle between both, 45°. The sum of slopes along one diagonal would not show that the largest ones have the wrong sign."""
 ONE_BY_ONE = 6
 """Largest number of unknowns that are checked one by one, with two rollouts each. With more, one diagonal direction is checked."""
 
@@ -51,14 +51,13 @@ class GradientCheck:
 
     @property
     def is_trusted(self) -> bool:
-        """Whether both have the same sign, and differ by at most the factor ``LARGEST_RATIO``. Slopes below ``SMALL`` only have to be small in both."""
+        """Whether both point the same way (``LEAST_COSINE``) and are of similar length (``LARGEST_RATIO``)."""
         gradient, difference = np.array(self.gradient), np.array(self.difference)
-        if not np.isfinite(gradient).all() or not difference.any():
+        if not np.isfinite(gradient).all() or not gradient.any() or not difference.any():
             return False
-        small = SMALL * np.abs(difference).max()
-        ratio = gradient / np.where(difference == 0, np.nan, difference)
-        agree = (ratio >= 1 / LARGEST_RATIO) & (ratio <= LARGEST_RATIO)
-        return bool((agree | (np.maximum(np.abs(gradient), np.abs(difference)) <= small)).all())
+        ratio = np.linalg.norm(gradient) / np.linalg.norm(difference)
+        cosine = gradient @ difference / (np.linalg.norm(gradient) * np.linalg.norm(difference))
+        return bool(cosine >= LEAST_COSINE and 1 / LARGEST_RATIO <= ratio <= LARGEST_RATIO)
 
     def __str__(self) -> str:
         if np.isnan(self.gradient).any():
