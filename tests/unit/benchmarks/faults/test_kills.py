@@ -74,8 +74,12 @@ def test_a_command_that_does_not_end_after_a_signal_hangs(tmp_path: Path, monkey
     class Runs(Ends):
         pid = 0
 
+    def waited(_: object, seconds: float) -> bool:
+        waits.append(seconds)
+        return False
+
     monkeypatch.setattr(isolation, "start", lambda *_: Runs(0))
-    monkeypatch.setattr(isolation, "waited", lambda _, seconds: bool(waits.append(seconds)))
+    monkeypatch.setattr(isolation, "waited", waited)
     monkeypatch.setattr(os, "kill", lambda *_: None)
     verdict = runs._killed(COMMANDS[0], tmp_path, tmp_path / "output", signal.SIGTERM, 0.3)
     assert verdict == Verdict("hung", "goes on for 5 s after SIGTERM") and waits == [0.3, runs.ANSWER]

@@ -122,7 +122,9 @@ def test_poses_that_touch_something_are_refused() -> None:
     obstacle.check_limits((0.05, 0.05, 0.2), own, nothing, scenes.SPACING)
     with pytest.raises(PoseError, match=r"shift, angle: at a shift of \(.*\) m and an angle of 0° the obstacle touches a wall"):
         obstacle.check_limits((0.0, 0.3, 0.0), own, nothing, scenes.SPACING)
-    beside = obstacle.centre + 0.95 * (np.array(obstacle.moved_shape((0.0, 0.0, 0.75)).vertices[1:2]) - obstacle.centre)  # type: ignore[attr-defined]
+    turned = obstacle.moved_shape((0.0, 0.0, 0.75))
+    assert isinstance(turned, Polygon)
+    beside = obstacle.centre + 0.95 * (np.array(turned.vertices[1:2]) - obstacle.centre)
     assert (RAMP.signed_distance(beside) > 0).all()
     with pytest.raises(PoseError, match="touches the material"):
         obstacle.check_limits((0.0, 0.0, 1.5), own, beside, scenes.SPACING)

@@ -15,7 +15,13 @@ from gpe_pl.evaluation.identification.gradient_check import GradientCheck, gradi
 def test_the_check_refuses_gradients_of_the_wrong_sign_or_size() -> None:
     assert GradientCheck((1.0,), (1.5,)).is_trusted
     assert GradientCheck((1.0, 0.05, -0.06), (1.0, -0.08, 0.0)).is_trusted  # slopes that hardly turn the search
-    pairs = (((-1.0,), (1.0,)), ((3.0,), (1.0,)), ((math.nan,), (1.0,)), ((1.0,), (0.0,)), ((0.0,), (1.0,)))
+    pairs: list[tuple[tuple[float, ...], tuple[float, ...]]] = [
+        ((-1.0,), (1.0,)),
+        ((3.0,), (1.0,)),
+        ((math.nan,), (1.0,)),
+        ((1.0,), (0.0,)),
+        ((0.0,), (1.0,)),
+    ]
     pairs += (((1.0, -0.5), (1.0, 0.6)), ((1.0, 1.5), (1.0, 0.05)), ((2.0, 1.0), (0.8, 0.5)), ((1.0, math.nan), (1.0, 0.5)))
     for wrong in (GradientCheck(*pair) for pair in pairs):
         assert not wrong.is_trusted
