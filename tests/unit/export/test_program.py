@@ -144,7 +144,11 @@ def test_static_friction(push: float) -> None:
     vel = np.where(floor[:, None], [push, 0.0], 0.0)
     gravity = np.array([0.0, 400.0])  # against which this untrained network pulls
     slow = replace(
-        state, vel=0.01 * state.vel, velocity_history=None, gravity=gravity, boundary=replace(state.boundary, vel=vel)
+        state,
+        vel=0.01 * state.vel,
+        velocity_history=None,
+        gravity=gravity,
+        boundary=replace(state.boundary, vel=vel, normal=-state.boundary.normal),
     ).to_torch()
     learned.static_friction = 0.99
     held = (learned.step(slow).pos == slow.pos).all(dim=1)
