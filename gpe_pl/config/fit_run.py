@@ -100,6 +100,8 @@ class FitRun:
             raise ConfigError(
                 f"evaluation.static_friction={self.evaluation.static_friction:g}: needs graph.islands=true, which model=gpe_tuned has"
             )
+        if self.evaluation.static_friction and not self.graph.boundary_condition:
+            raise ConfigError(f"evaluation.static_friction={self.evaluation.static_friction:g}: needs graph.boundary_condition=true")
         self.start = None if cfg.start_from is None else LearnedSimulator.from_checkpoint(cfg.start_from)
         self.callbacks: list[PauseForMeasurements] = []
 

@@ -39,6 +39,8 @@ PROBED, FARTHEST = 1.5, 4.0
 """Largest distance from a wall at which its relief is computed, and largest one of nodes that have a relief, in rest spacings."""
 WITHOUT_RELIEF = ("wall", "bowl")
 """Shapes that are nowhere sharper than a flat wall."""
+TOUCHING = 0.1
+"""Depth in rest spacings up to which an undeformed node touches a wall instead of being in it."""
 ATTACHED, FLATTEST, MOST_NEAR = 1.8, 0.1, 40
 """Distance in rest spacings of the nodes to which loose nodes are attached, least volume of such a cell over that of a box of its longest edge, and the number
 of nearest nodes that are tried."""
@@ -71,7 +73,9 @@ def add_cells(
         entries = (_entries_in_compiled_loops if compiled else _entries)(topology, state, material, at_rest, scales, precision)
         wall = entries["wall"]
         entries["relief"] = _reliefs(state, topology.rows[material], wall, scales.spacing) if reads_relief else wall.new_zeros(len(wall))
-        entries["rest_gap"] = _rest_gaps(topology, state, material).to(wall) if reads_relief else torch.full_like(wall[:, 0], torch.inf)
+        entries["rest_gap"] = (
+            _rest_gaps(topology, state, material, scales.spacing).to(wall) if reads_relief else torch.full_like(wall[:, 0], torch.inf)
+        )
         touching = _touching(topology, state, material, TOUCH_REACH * scales.spacing, precision)
         own = {"cell_index": at_rest.cell_index, "attached_index": at_rest.attached_index, "rest_pos": at_rest.pos}
         data[material].update({**own, **entries, **touching})
@@ -177,10 +181,11 @@ def _reliefs(state: State, rows: Tensor, wall: Tensor, spacing: float) -> Tensor
     return relief
 
 
-def _rest_gaps(topology: Topology, state: State, material: str) -> Tensor:
+@torch.inference_mode(False)  # a rollout may be the first to ask, and training the next
+def _rest_gaps(topology: Topology, state: State, material: str, spacing: float) -> Tensor:
     """Return how far the undeformed nodes [node] are from walls [m]; infinite without cells, and where the undeformed shape reaches into a wall.
 
-    The result is kept with the mesh for as long as the boundary is the same.
+    Rest positions count as those of the scene. The result is kept with the mesh for as long as the boundary is the same, and has no gradient.
     """
     rows, mesh, boundary = topology.rows[material], topology.mesh, state.boundary
     if mesh is None or state.cells is None or not len(rows) or not len(boundary.pos):
@@ -195,7 +200,8 @@ def _rest_gaps(topology: Topology, state: State, material: str) -> Tensor:
             nearest = boundary.tree(topology.periodicity).query(pos)[1]
             way = topology.periodicity.shortest(pos - as_numpy(boundary.pos)[nearest])
             gap = (way * as_numpy(boundary.normal)[nearest]).sum(axis=1)
-        kept[material] = now, torch.from_numpy(np.where(gap > 0, gap, np.inf)).to(state.pos.device)
+        at_wall = gap > -TOUCHING * spacing  # also a body that lies on the floor, up to rounding
+        kept[material] = now, torch.from_numpy(np.where(at_wall, np.maximum(gap, 0.0), np.inf)).to(state.pos.device)
     return kept[material][1]
 
 

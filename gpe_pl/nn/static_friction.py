@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from gpe_pl.schema import STICKY
 from gpe_pl.trajectory.boundary import as_numpy
 from gpe_pl.trajectory.state import State
 
@@ -38,7 +39,7 @@ def bears(
         gravity: acceleration by gravity [m/s²]. Without it, no wall bears.
     """
     along = -(normal @ gravity.to(normal.dtype))
-    return along > (1 - LEVEL) * gravity.norm() / (1 + friction.square()).sqrt()
+    return along > (1 - LEVEL) * gravity.norm() / (1 + friction.clamp(max=STICKY).square()).sqrt()
 
 
 def supported(is_free: Bool[Tensor, " island"], contacts: Iterable[Contacts]) -> Bool[Tensor, " island"]:

@@ -25,7 +25,8 @@ def round_middle(low: np.ndarray, high: np.ndarray, periods: np.ndarray) -> np.n
 def near_origin(rest_pos: np.ndarray, pos: np.ndarray, periodicity: Periodicity) -> np.ndarray:
     """Return rest positions [node, dim] in m, moved along each axis along which they are far from 0 and from all positions.
 
-    Stored rest positions are float32, which is most precise near 0. Only differences of rest positions matter, so they may have an origin of their own. Those
+    Stored rest positions are float32, which is most precise near 0. Differences of rest positions matter, so they may have an origin of their own; only the
+    layer of walls of the elastic law takes their distance from walls. Those
     in the same coordinates as positions keep these: ``Trajectory.seen_from`` moves both, and their difference is the displacement.
 
     Args:

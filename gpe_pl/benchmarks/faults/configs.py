@@ -89,11 +89,11 @@ def started(command: Command, override: str, must_fail: bool, expected: dict[str
         command = replace(command, data=None)
     ended = run(command.module, [*command.given(folder), override], limit)
     verdict = ended.verdict("accepted" if must_fail else "harmless")
+    if verdict.status in ("harmless", "refused") and list(folder.rglob("*.part*")):
+        return Verdict("half-written", verdict.detail)
     if verdict.status == "harmless":
         verdict = compared(folder, expected, verdict.detail)
         return Verdict("changed", verdict.detail) if verdict.status == "different" else verdict
-    if verdict.status == "refused" and list(folder.rglob("*.part*")):
-        return Verdict("half-written", verdict.detail)
     return verdict
 
 

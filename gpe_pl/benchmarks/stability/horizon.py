@@ -131,8 +131,8 @@ def rest(subject: Subject) -> Outcome:
         return inapplicable(settled)
     solver = drift(subject, subject.spec.label_solver, settled)
     limits = max(MAX_DRIFT, 2 * solver.farthest), max(MAX_CHANGE, 2 * solver.change)
-    own = subject.simulator.static_friction
-    fractions = [own, 0.0 if own else STATIC_FRICTION] if subject.simulator.builder.spec.islands else [0.0]
+    own, build = subject.simulator.static_friction, subject.simulator.builder
+    fractions = [own, 0.0 if own else STATIC_FRICTION] if build.spec.islands and build.config.boundary_condition else [0.0]
     still = np.zeros((settled.num_nodes, subject.history, settled.dim))
     start = replace(settled, velocity_history=still, internal=None, stress=None).to_torch()
     found = [drift(subject, Contained(subject.simulator.configured(static_friction=f), subject.dt), start) for f in fractions]

@@ -62,7 +62,7 @@ function bearing(boundary, model) {
   const [x, y] = model.gravity, level = (1 - model.level) * Math.hypot(x, y);
   return Uint8Array.from({ length: boundary.count }, (_, b) => {
     const along = -(boundary.normal[2 * b] * x + boundary.normal[2 * b + 1] * y);
-    return along > level / Math.sqrt(1 + boundary.friction[b] ** 2) ? 1 : 0;
+    return along > level / Math.sqrt(1 + Math.min(boundary.friction[b], 1e6) ** 2) ? 1 : 0;
   });
 }
 
