@@ -3,8 +3,8 @@
 The errors of a network at rest add up over frames, so that a heap creeps. A node is therefore kept in place if it is slower, before and after a step, than a
 fraction of the speed that gravity gives in one frame. A resting node starts to move when the unbalanced part of gravity exceeds this fraction. Unsupported
 nodes are accelerated by all of gravity and fall. Nodes are kept in place only if they have edges to a wall at rest that bears them, directly or through other
-nodes, and no edges to a moving wall. A wall bears what it is below, if it is no steeper than its angle of friction (Coulomb's law): a ceiling bears nothing,
-and a slope of 45° only with a friction coefficient of 1 or more. Openings and prescribed nodes that move count as moving walls. Where they are at rest, they
+nodes, and no edges to a moving wall. A wall bears a node above it if it is no steeper than its angle of friction (Coulomb's law): a ceiling bears nothing, and
+a slope of 45° only with a friction coefficient of 1 or more. Openings and prescribed nodes that move count as moving walls. Where they are at rest, they
 hold nothing either.
 """
 

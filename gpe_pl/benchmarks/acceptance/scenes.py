@@ -96,7 +96,7 @@ def dropped_block(spec: DatasetSpec, value: float, columns: int, rows: int, gap:
 
 
 def placed_block(spec: DatasetSpec, value: float, columns: int, rows: int) -> State:
-    """Return a block of ``columns`` × ``rows`` squares at rest, half a spacing above the middle of the floor, as the solver's bodies lie."""
+    """Return a block of ``columns`` × ``rows`` squares at rest, half a spacing above the middle of the floor."""
     return dropped_block(spec, value, columns, rows, 0.5 * spec.scene.spacing, 0.0)
 
 
