@@ -80,8 +80,8 @@ def _resting(simulator: LearnedSimulator) -> str:
     if not fraction:
         return ""
     return (
-        f" Its static friction is {fraction:g}: a node at rest on a wall moves only if the unbalanced part of gravity exceeds this fraction. The errors below "
-        "were measured without it."
+        f" Its static friction is {fraction:g}: a node at rest on a wall moves only if the unbalanced part of gravity exceeds this fraction, and walls push "
+        "and rub by Coulomb's law. The errors below were measured without it."
     )
 
 

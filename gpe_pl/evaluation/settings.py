@@ -38,7 +38,7 @@ class EvaluationSettings:
         num_uncontained: number of trajectories per split that are also rolled out without containment, which shows what it corrects; None takes all.
         clamp_parameters: clamp material parameters outside the trained range to the nearest trained value.
         static_friction: nodes that walls support stay in place if they are slower than this fraction of the speed that gravity gives in one frame (see
-            ``nn.static_friction``); None takes the model's own value.
+            ``nn.static_friction``), and planes act by Coulomb's law (``nn.friction_cone``), unless it is 0; None takes the model's own value.
         mirror_average: average each step over the scene and its mirror images (see ``learned.mirror_average``); None takes the model's own value.
         material_controls: roll scenes with unseen parameters out with other parameters, too (see ``material_controls``).
         num_pictures: number of trajectories per split that get a figure, an animation and a viewer. With 0, no curve of errors is drawn, either.

@@ -19,6 +19,7 @@ from gpe_pl.graphs.features import GAP_LIMIT, GAP_SCALE, TINY
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.blocks import NORM_EPS
+from gpe_pl.nn.friction_cone import ALIKE, NO_SLIP
 from gpe_pl.nn.static_friction import LEVEL
 from gpe_pl.schema import BOUNDARY, EdgeType
 
@@ -117,6 +118,8 @@ def model_for_page(simulator: LearnedSimulator) -> tuple[dict[str, Any], np.ndar
         "nodeMass": float(simulator.standardizer.mass),
         "staticFriction": simulator.static_friction,
         "level": LEVEL,
+        "alike": ALIKE,
+        "noSlip": NO_SLIP,
         "islandMomentum": simulator.model.settings["island_momentum"],
         "trained": dict(simulator.described_training()),
         "parameters": [

@@ -82,8 +82,8 @@ class ExportedStep(nn.Module):
     def forward(self, scene: Scene) -> tuple[Scene, Scene]:
         """Return two dictionaries: the changed tensors, and what the model predicts.
 
-        The changed tensors are positions and velocity histories. The predictions are accelerations with gravity [m/s²], and stresses [Pa] of the materials that
-        have one.
+        The changed tensors are positions and velocity histories. The predictions are accelerations with gravity, before static friction [m/s²], and stresses
+        [Pa] of the materials that have one.
         """
         simulator, state, topology = self.simulator, self.state(scene), self.topology(scene)
         graph = simulator.builder.graph(topology, state)

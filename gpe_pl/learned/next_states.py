@@ -6,7 +6,7 @@ most of the time of a PyTorch operation is its overhead.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import no_type_check
 
@@ -17,14 +17,14 @@ from torch import Tensor
 from torch_geometric.data import HeteroData
 
 from gpe_pl.graphs.compiled_graph import works_on
-from gpe_pl.graphs.features import boundary_values
-from gpe_pl.graphs.topology import Topology
-from gpe_pl.nn.static_friction import Contacts, bears, pushed, supported
+from gpe_pl.nn.friction_cone import limit
+from gpe_pl.nn.static_friction import LEVEL, keeps_position, supported
 from gpe_pl.nn.stores import contents
-from gpe_pl.schema import BOUNDARY, FeatureSpec
+from gpe_pl.nn.wall_contacts import WallContacts
+from gpe_pl.schema import STICKY
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import mean_over_corners
-from gpe_pl.trajectory.rigid_bodies import moved_rigidly
+from gpe_pl.trajectory.rigid_bodies import all_of_bodies, moved_rigidly
 from gpe_pl.trajectory.state import State, Stress
 
 Rows = Mapping[str, Tensor]
@@ -36,7 +36,14 @@ def works_on_all(states: list[State], predicted: dict[str, Tensor]) -> bool:
     return all(map(works_on, states)) and not any(values.requires_grad for values in predicted.values())
 
 
-def moved(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor], unit: float, dt: float) -> list[State]:
+def moved(
+    states: list[State],
+    rows: Sequence[Rows],
+    predicted: dict[str, Tensor],
+    unit: float,
+    dt: float,
+    contacts: Sequence[WallContacts] = (),
+) -> list[State]:
     """Return the states one frame later, given the accelerations that a model predicts.
 
     Args:
@@ -45,10 +52,13 @@ def moved(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor
         predicted: accelerations without gravity for the batch, by material.
         unit: unit of these accelerations [m/s²].
         dt: frame interval [s].
+        contacts: contacts of each scene with walls that obey Coulomb's law (``nn.friction_cone``); none if they need not.
     """
     acc = [np.tile(state.gravity.numpy(), (state.num_nodes, 1)) for state in states]
     for scene, own, part in per_scene(predicted, rows):
         _add(part.contiguous().numpy(), own.numpy(), unit, acc[scene])
+    for state, a, touching in zip(states, acc, contacts, strict=False):
+        limit(a, state.mass.numpy(), state.gravity.numpy(), touching)
     new = []
     for state, a in zip(states, acc, strict=True):
         pos, vel = integrators.advance(state.pos.numpy(), state.vel.numpy(), a, dt)
@@ -61,53 +71,43 @@ def moved(states: list[State], rows: Sequence[Rows], predicted: dict[str, Tensor
     return new
 
 
-def keep_slow(state: State, new: State, topology: Topology, fraction: float, dt: float) -> None:
+def keep_slow(state: State, new: State, contacts: WallContacts, fraction: float, dt: float) -> None:
     """Put nodes that static friction keeps in place back to their old positions, with zero velocity, in the arrays of a new state (see ``nn.static_friction``).
 
     Args:
         state: state before the step, whose walls are at rest.
         new: state that ``moved`` and ``with_frame_velocity`` returned. Its arrays are changed.
-        topology: topology of ``state``.
+        contacts: contacts of ``state`` with walls.
         fraction: fraction of the speed that gravity gives in one frame, below which a node keeps its position.
         dt: frame interval [s].
     """
-    assert topology.islands is not None
-    label = topology.islands.label
-    is_held = supported(topology.islands.is_free, [*_walls_at_rest(state, topology, label), *pushed(state, label, dt)])
     given = None if state.loads is None else (new.pos.clone(), new.vel.clone())
     history = new.vel[:, None] if new.velocity_history is None else new.velocity_history
     at_frame = new.vel if new.frame_velocity is None else new.frame_velocity
-    before = (state.pos.numpy(), state.vel.numpy(), label.numpy(), is_held.numpy())
-    _keep_slow(*before, state.gravity.numpy(), fraction * dt, new.pos.numpy(), new.vel.numpy(), history.numpy(), at_frame.numpy())
+    before = (state.pos.numpy(), state.vel.numpy(), contacts.island.numpy(), contacts.is_pushed.numpy(), state.gravity.numpy())
+    edges = contacts.at.numpy(), contacts.normal.numpy(), contacts.friction.numpy()
+    _keep_slow(*before, *edges, fraction * dt, new.pos.numpy(), new.vel.numpy(), history.numpy(), at_frame.numpy())
     if state.loads is not None and given is not None:  # static friction does not stop nodes whose motion is given
         held = torch.from_numpy(state.loads.prescribed)
         for values, moved_as_given in ((new.pos, given[0]), (new.vel, given[1]), (history[:, -1], given[1]), (at_frame, given[1])):
             values[held] = moved_as_given[held]
 
 
-def _walls_at_rest(state: State, topology: Topology, label: Tensor) -> Iterator[Contacts]:
-    """Yield the contacts of islands with walls, given the island of each node."""
-    boundary = state.boundary
-    can_bear = bears(torch.as_tensor(boundary.normal), torch.as_tensor(boundary.friction), state.gravity)
-    can_bear = can_bear if topology.boundary_rows is None else can_bear[topology.boundary_rows]
-    for relation, (j, i) in topology.edges.items():
-        if relation[0] == BOUNDARY:
-            yield label[topology.rows[relation[2]]][i], torch.zeros_like(j, dtype=torch.bool), can_bear[j]
-
-
-def supported_in(graph: HeteroData, spec: FeatureSpec, gravity: Tensor, others: Iterable[Contacts]) -> Tensor:
-    """Return a mask [island] of the islands of a scene's graph that static friction may keep in place.
+def slow_kept(state: State, new: State, contacts: WallContacts, fraction: float, dt: float) -> State:
+    """Return the new state, in which nodes that static friction keeps in place have their old positions and zero velocity; rigid bodies as a whole.
 
     Args:
-        graph: graph whose features are not standardised, and whose boundary nodes have a boundary condition.
-        spec: channels of the graph.
-        gravity: acceleration by gravity [dim] in m/s².
-        others: contacts besides walls.
+        state: state before the step.
+        new: state after it without static friction.
+        contacts: contacts of ``state`` with walls.
+        fraction: fraction of the speed that gravity gives in one frame, below which a node keeps its position.
+        dt: frame interval [s].
     """
-    vel, normal, friction = boundary_values(graph[BOUNDARY].x, spec.dim)
-    moves, can_bear = (vel != 0).any(dim=1), bears(normal, friction, gravity)
-    edges = [(graph[relation].edge_index, graph[relation[2]].island) for relation in spec.relations if relation[0] == BOUNDARY]
-    return supported(graph.island_is_free, [*others, *((island[i], moves[j], can_bear[j]) for (j, i), island in edges)])
+    is_supported = supported(contacts, state.gravity)
+    stays = keeps_position(state.vel, new.vel, contacts.island, is_supported, fraction * dt * state.gravity.norm())
+    stays = all_of_bodies(stays, state.rigid_body)[:, None]
+    new = new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))
+    return new if new.frame_velocity is None else replace(new, frame_velocity=torch.where(stays, 0.0, new.frame_velocity))
 
 
 def advanced(state: State, acc: Tensor, dt: float) -> State:
@@ -185,14 +185,21 @@ def per_scene(predicted: dict[str, Tensor], rows: Sequence[Rows]) -> Iterator[tu
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def _keep_slow(old_pos, old_vel, island, is_held, gravity, duration, pos, vel, history, at_frame):
-    speed = duration * np.sqrt((gravity * gravity).sum())
+def _keep_slow(old_pos, old_vel, island, is_pushed, gravity, at, normal, friction, duration, pos, vel, history, at_frame):
+    strength = np.sqrt((gravity * gravity).sum())
+    speed, rests = duration * strength, np.zeros(len(is_pushed), np.bool_)
+    for e in range(len(at)):  # whether the wall bears, as in ``static_friction.bears``
+        along = 0.0
+        for a in range(len(gravity)):
+            along -= normal[e, a] * gravity[a]
+        if along > (1 - LEVEL) * strength / np.sqrt(1.0 + min(friction[e], STICKY) ** 2):
+            rests[at[e]] = True
     for n in range(pos.shape[0]):
         before, after = 0.0, 0.0
         for a in range(pos.shape[1]):
             before += old_vel[n, a] ** 2
             after += vel[n, a] ** 2
-        if not (is_held[island[n]] and before < speed**2 and after < speed**2):
+        if not (rests[island[n]] and not is_pushed[island[n]] and before < speed**2 and after < speed**2):
             continue
         for a in range(pos.shape[1]):
             pos[n, a] = old_pos[n, a]

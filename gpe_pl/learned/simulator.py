@@ -42,16 +42,17 @@ from gpe_pl.learned.rollout_settings import RolloutSettings
 from gpe_pl.learned.start_checks import SceneError as SceneError
 from gpe_pl.learned.start_checks import check_derivatives, check_start, inside_obstacles
 from gpe_pl.learned.transfer import Transfer
+from gpe_pl.learned.wall_contacts import of_graph, of_topology
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
+from gpe_pl.nn.friction_cone import limited
 from gpe_pl.nn.node_loads import scaled
-from gpe_pl.nn.static_friction import keeps_position, pushed
 from gpe_pl.nn.stores import predicted_rows
+from gpe_pl.nn.wall_contacts import WallContacts
 from gpe_pl.rollout.loop import SimulationError, sound
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import EdgeType
 from gpe_pl.system.signatures import check_plain, checked
-from gpe_pl.trajectory.rigid_bodies import all_of_bodies
 from gpe_pl.trajectory.scene_ranges import described, outside, scene_range, unlimited
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
@@ -78,7 +79,7 @@ class LearnedSimulator(nn.Module):
             a rollout of the simulator itself is exact.
         clamps_parameters: clamp material parameters outside the range of training to the nearest trained value. A network is less reliable outside this range.
         static_friction: fraction of the speed that gravity gives in one frame. Nodes on a wall that are slower keep their positions (see
-            ``nn.static_friction``). 0 switches this off.
+            ``nn.static_friction``), and planes act by Coulomb's law, whatever the fraction (see ``nn.friction_cone``). 0 switches both off.
         mirror_average: average each step of a rollout over the scene and its mirror images (see ``mirror_average``).
         least_distance: liquid nodes that come nearer in a rollout are pushed apart [m] (see ``least_distance``). 0 switches this off.
         acceleration_std, stress_std: units of the model's accelerations [m/s²] and stresses [Pa].
@@ -460,26 +461,37 @@ class LearnedSimulator(nn.Module):
         data = data.to(self.acceleration_std.device) if self.acceleration_std.device != states[0].pos.device else data
         units = builder.spec.materials, self.acceleration_std
         predicted = (self.model(scaled(data, *units)) if standards is not None else self(data)).to(states[0].pos.device)
-        new = self.later(states, rows, predicted)
-        if self.static_friction and standards is None:
-            new = [self._with_static_friction(*parts) for parts in zip(states, new, graphs, strict=True)]
-        elif self.static_friction:  # walls are at rest
-            for state, after, topology in zip(states, new, topologies, strict=True):
-                next_states.keep_slow(state, after, topology, self.static_friction, builder.metadata.frame_dt)
+        contacts = self._contacts(states, graphs if standards is None else topologies)
+        new = self.later(states, rows, predicted, contacts)
+        if standards is None:
+            return self._with_static_friction(states, new, contacts)
+        for state, after, touching in zip(states, new, contacts, strict=False):
+            next_states.keep_slow(state, after, touching, self.static_friction, builder.metadata.frame_dt)
         return new
 
     def moved(self, states: list[State], graphs: list[HeteroData], predicted: Prediction) -> list[State]:
         """Return the states one frame later, given the states, their graphs, and the model's prediction for their batch."""
-        new = self.later(states, [*map(next_states.rows_of, graphs)], predicted)
-        return [self._with_static_friction(*parts) for parts in zip(states, new, graphs, strict=True)] if self.static_friction else new
+        contacts = self._contacts(states, graphs)
+        return self._with_static_friction(states, self.later(states, [*map(next_states.rows_of, graphs)], predicted, contacts), contacts)
 
-    def later(self, states: list[State], rows: Sequence[Rows], predicted: Prediction) -> list[State]:
-        """Do the same as ``moved`` without static friction, given the rows of each material's nodes. Training states get a stress only if graphs read it."""
+    def _contacts(self, states: list[State], found: Sequence[Topology] | Sequence[HeteroData]) -> list[WallContacts]:
+        """Return the contacts with walls of scenes whose graphs or topologies are given; none without static friction."""
+        spec, dt, known = self.builder.spec, self.builder.metadata.frame_dt, zip(states, found, strict=False)
+        return [of_topology(s, f, dt) if isinstance(f, Topology) else of_graph(s, f, spec, dt) for s, f in known if self.static_friction]
+
+    def later(self, states: list[State], rows: Sequence[Rows], predicted: Prediction, contacts: Sequence[WallContacts] = ()) -> list[State]:
+        """Do the same as ``moved`` without keeping slow nodes in place, given the rows of each material's nodes, and contacts that obey Coulomb's law.
+
+        Training states get a stress only if graphs read it.
+        """
         acceleration, dt = predicted.acceleration, self.builder.metadata.frame_dt
+        contacts = () if predicted.frame_velocity else contacts  # walls of the elastic law obey Coulomb's law within the frame
         if next_states.works_on_all(states, acceleration):
-            new = next_states.moved(states, rows, acceleration, float(self.acceleration_std), dt)
+            new = next_states.moved(states, rows, acceleration, float(self.acceleration_std), dt, contacts)
         else:
             all_acc = next_states.accelerations(states, rows, acceleration, self.acceleration_std)
+            for k, (state, touching) in enumerate(zip(states, contacts, strict=False)):
+                all_acc[k] = limited(all_acc[k], state.mass, state.gravity, touching)
             new = [self.advance(state, acc) for state, acc in zip(states, all_acc, strict=True)]
         new = next_states.with_frame_velocity(new, rows, predicted.frame_velocity, dt)
         if self.least_distance and not self.training:
@@ -490,26 +502,15 @@ class LearnedSimulator(nn.Module):
         return next_states.with_stress(new, rows, predicted.stress, self.stress_std, components)
 
     def integrated(self, state: State, graph: HeteroData, acc: Tensor) -> State:
-        """Return the next state under an acceleration [node, dim] in m/s² that includes gravity. Static friction keeps slow nodes in place."""
-        new = self.advance(state, acc)
-        return self._with_static_friction(state, new, graph) if self.static_friction else new
+        """Return the next state under an acceleration [node, dim] in m/s² that includes gravity, with static friction."""
+        contacts = self._contacts([state], [graph])
+        for touching in contacts:
+            acc = limited(acc, state.mass, state.gravity, touching)
+        return self._with_static_friction([state], [self.advance(state, acc)], contacts)[0]
 
-    def _with_static_friction(self, state: State, new: State, graph: HeteroData) -> State:
-        """Return the new state, in which nodes that static friction keeps in place have their old positions and zero velocity."""
-        island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
-        for material in self.builder.spec.materials:
-            island[graph[material].node_id] = graph[material].island
-        is_supported = next_states.supported_in(
-            graph, self.builder.spec, state.gravity, pushed(state, island, self.builder.metadata.frame_dt)
-        )
-        stays = keeps_position(state.vel, new.vel, island, is_supported, self.slowest(state.gravity))
-        stays = all_of_bodies(stays, state.rigid_body)[:, None]
-        new = new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))
-        return new if new.frame_velocity is None else replace(new, frame_velocity=torch.where(stays, 0.0, new.frame_velocity))
-
-    def slowest(self, gravity: Tensor) -> Tensor:
-        """Return the speed [m/s] below which static friction keeps nodes in place."""
-        return self.static_friction * self.builder.metadata.frame_dt * gravity.norm()
+    def _with_static_friction(self, states: list[State], new: list[State], contacts: list[WallContacts]) -> list[State]:
+        settings = self.static_friction, self.builder.metadata.frame_dt
+        return [next_states.slow_kept(*parts, *settings) for parts in zip(states, new, contacts, strict=True)] if contacts else new
 
     def advance(self, state: State, acc: Tensor) -> State:
         """Return the next state under an acceleration [node, dim] in m/s² that includes gravity, without static friction. Rigid bodies keep their shape."""

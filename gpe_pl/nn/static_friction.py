@@ -5,27 +5,20 @@ fraction of the speed that gravity gives in one frame. A resting node starts to 
 nodes are accelerated by all of gravity and fall. Nodes are kept in place only if they have edges to a wall at rest that bears them, directly or through other
 nodes, and no edges to a moving wall. A wall bears a node above it if it is no steeper than its angle of friction (Coulomb's law): a ceiling bears nothing, and
 a slope of 45° only with a friction coefficient of 1 or more. Openings and prescribed nodes that move count as moving walls. Where they are at rest, they
-hold nothing either.
+hold nothing either. With static friction, the total forces of walls obey Coulomb's law, too (see ``nn.friction_cone``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from gpe_pl.nn.wall_contacts import WallContacts
 from gpe_pl.schema import STICKY
-from gpe_pl.trajectory.boundary import as_numpy
-from gpe_pl.trajectory.state import State
 
 LEVEL = 1e-4
 """Rounding that the cosine of a wall's slope may have, so that a frictionless level floor bears."""
-
-Contacts = tuple[Int64[Tensor, " edge"], Bool[Tensor, " edge"], Bool[Tensor, " edge"]]
-"""For edges to walls: the island at one end, and whether the wall at the other end moves and whether it bears (``bears``)."""
 
 
 def bears(
@@ -42,33 +35,12 @@ def bears(
     return along > (1 - LEVEL) * gravity.norm() / (1 + friction.clamp(max=STICKY).square()).sqrt()
 
 
-def supported(is_free: Bool[Tensor, " island"], contacts: Iterable[Contacts]) -> Bool[Tensor, " island"]:
-    """Return a mask of the islands that touch a wall that bears, and none that moves.
-
-    Args:
-        is_free: whether nothing outside touches an island. Openings and prescribed nodes do.
-        contacts: edges to walls.
-    """
-    walls = pushes = torch.zeros(is_free.shape[0], device=is_free.device)
-    for island, is_moving, is_bearing in contacts:
-        walls = walls.index_add(0, island, is_bearing.to(walls.dtype))
-        pushes = pushes.index_add(0, island, is_moving.to(pushes.dtype))
-    return ~is_free & (walls > 0) & (pushes == 0)
-
-
-def pushed(state: State, island: Int64[Tensor, " node"], dt: float) -> list[Contacts]:
-    """Return contacts of the nodes that openings or given motion move in the frame of ``dt`` [s] that begins with a state."""
-    if not state.openings and state.loads is None:
-        return []
-    pos, is_moved = as_numpy(state.pos), np.zeros(state.num_nodes, bool)
-    for opening in state.openings:
-        if opening.drives and opening.mean_velocity(state.time, state.time + dt).any():
-            is_moved |= opening.contains(pos)
-    if state.loads is not None:
-        is_moved[state.loads.rows] |= (state.loads.next_positions() != state.loads.path[0]).any(axis=1)
-    moving = island[torch.from_numpy(np.flatnonzero(is_moved)).to(island.device)]
-    moves = torch.ones_like(moving, dtype=torch.bool)
-    return [(moving, moves, ~moves)]
+def supported(contacts: WallContacts, gravity: Float[Tensor, " dim"]) -> Bool[Tensor, " island"]:
+    """Return a mask of the islands that touch a wall that bears, and that nothing moves: no wall, opening or given motion."""
+    walls = pushes = torch.zeros(contacts.is_pushed.shape[0], device=gravity.device)
+    walls = walls.index_add(0, contacts.at, bears(contacts.normal, contacts.friction, gravity).to(walls.dtype))
+    pushes = pushes.index_add(0, contacts.at, contacts.moves.to(pushes.dtype))
+    return ~contacts.is_pushed & (walls > 0) & (pushes == 0)
 
 
 def keeps_position(

@@ -20,6 +20,7 @@ from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator, SceneErr
 from gpe_pl.models.base import Prediction
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.static_friction import bears, supported
+from gpe_pl.nn.wall_contacts import WallContacts
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import STICKY
 from gpe_pl.system.compiled import unfused
@@ -196,14 +197,16 @@ def test_what_moves_from_outside_holds_nothing(kind: str, is_compiled: bool) -> 
 
 
 def test_islands_that_touch_walls_none_of_which_moves_and_one_of_which_bears() -> None:
-    is_free = torch.tensor([False, False, True, False, False, False])
-    none = torch.empty(0, dtype=torch.bool)
-    contacts = [
-        (torch.tensor([0, 1, 1]), torch.tensor([False, False, True]), torch.tensor([True, True, False])),
-        (torch.tensor([3, 4, 5, 5]), torch.tensor([False] * 4), torch.tensor([True, False, False, True])),
-        (torch.empty(0, dtype=torch.int64), none, none),
-    ]
-    assert supported(is_free, contacts).tolist() == [True, False, False, True, False, True]
+    at = torch.tensor([0, 1, 1, 3, 4, 5, 5])
+    bearing = torch.tensor([True, True, False, True, False, False, True])
+    moves = torch.tensor([False, False, True, False, False, False, False])
+    normal = torch.where(bearing[:, None], torch.tensor([0.0, 1.0]), torch.tensor([1.0, 0.0]))
+    is_pushed = torch.zeros(7, dtype=torch.bool)
+    contacts = WallContacts(torch.arange(7), is_pushed, is_pushed, at, normal, torch.zeros(7), moves)
+    gravity = torch.tensor([0.0, -9.81])
+    assert supported(contacts, gravity).tolist() == [True, False, False, True, False, True, False]
+    pushed = replace(contacts, is_pushed=torch.arange(7) == 3)
+    assert supported(pushed, gravity).tolist() == [True, False, False, False, False, True, False]
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -137,6 +137,8 @@ def test_static_friction_holds_what_lies_and_not_what_leans(simulator: LearnedSi
     (after,) = in_python(simulator, at_rest, 1)
     stays = (after.pos.numpy() == pos).all(axis=1)
     assert stays[:49].any() and not stays[49:].any()
+    leans, fallen = slice(49, 49 + 25), -9.81 * simulator.builder.metadata.frame_dt
+    assert after.vel[leans, 1].mean() == pytest.approx(fallen, abs=1e-9)  # a smooth wall does not rub
     assert np.abs(in_javascript(simulator, [at_rest], 1)["pos"][0] - after.pos.numpy()).max() < 1e-7
 
 

@@ -1,4 +1,4 @@
-// One step of the learned simulator: graph, features, network, conservation of momentum, integration, static friction, containment.
+// One step of the learned simulator: graph, features, network, conservation of momentum, friction of walls, integration, containment.
 
 import { Heap, kernelsOf } from "./kernels.mjs";
 import { Network } from "./network.mjs";
@@ -113,6 +113,34 @@ function conserve(acc, state, islands, angular) {
   }
 }
 
+/** Bring the forces of planes on islands that touch nothing else into their friction cones: planes push and rub, but hold nothing. */
+function limit(acc, state, islands, walls, boundary, held, model) {
+  const { label, number } = islands, { mass, count } = state;
+  const sum = new Float64Array(7 * number); // edges, normal x and y, largest friction, mass, force x and y
+  for (let e = 0; e < walls.length; e += 2) {
+    const b = walls.values[e], s = 7 * label[walls.values[e + 1]];
+    sum[s]++;
+    sum[s + 1] += boundary.normal[2 * b], sum[s + 2] += boundary.normal[2 * b + 1];
+    sum[s + 3] = Math.max(sum[s + 3], boundary.friction[b]);
+  }
+  for (let n = 0; n < count; n++) {
+    const s = 7 * label[n];
+    if (held && held.mask[n]) sum[s + 3] = Infinity;
+    sum[s + 4] += mass[n];
+    sum[s + 5] += mass[n] * acc[2 * n], sum[s + 6] += mass[n] * acc[2 * n + 1];
+  }
+  const change = new Float64Array(2 * number);
+  for (let k = 0; k < number; k++) {
+    const [edges, x, y, friction, total, fx, fy] = sum.subarray(7 * k, 7 * k + 7), length = Math.hypot(x, y);
+    if (!edges || length <= (1 - model.alike) * edges || friction >= model.noSlip) continue;
+    const nx = x / length, ny = y / length, along = (fx * nx + fy * ny) / total, tx = fx / total - along * nx, ty = fy / total - along * ny;
+    const pushes = Math.max(along, 0), across = Math.hypot(tx, ty), share = across > 0 ? Math.min((friction * pushes) / across, 1) : 1;
+    change[2 * k] = pushes * nx + share * tx - fx / total;
+    change[2 * k + 1] = pushes * ny + share * ty - fy / total;
+  }
+  for (let n = 0; n < count; n++) for (let a = 0; a < 2; a++) acc[2 * n + a] += change[2 * label[n] + a];
+}
+
 /** A model that advances a state by one frame.
  *
  * A state has count, pos, vel and mass of its nodes, history (velocities, oldest first: [node, history, axis]) and params [node, parameter].
@@ -141,6 +169,7 @@ export class Simulator {
     }
     const islands = islandsOf(count, pairs, walls, bearing(boundary, model));
     if (model.islandMomentum !== "ignored") conserve(acc, state, islands, model.islandMomentum === "angular");
+    if (model.staticFriction > 0) limit(acc, state, islands, walls, boundary, held, model);
     this.integrate(state, acc, islands, held);
     const corrected = contain(shapes, state, model.frameDt);
     this.remember(state);
