@@ -20,6 +20,7 @@ from gpe_pl.data.validate import outside_bounds
 from gpe_pl.schema import HISTORY, NODE_TYPES, stored_parameters
 from gpe_pl.trajectory import cells_at_rest
 from gpe_pl.trajectory.arrays import RADIUS_SPACINGS, nearest_distances
+from gpe_pl.trajectory.cells import bodies
 from gpe_pl.trajectory.cells_at_rest import ROUNDING
 from gpe_pl.trajectory.rigid_deformation import rigid_deformation
 from gpe_pl.trajectory.store import stored_arrays
@@ -154,6 +155,11 @@ class Survey:
         if trajectory.cells is not None and trajectory.rest_pos is not None:
             mesh = (trajectory.cells, trajectory.cell_dim, trajectory.rest_pos, m.periodicity)
             self.suspects += [Event(split, name, -1, what) for what in cells_at_rest.suspects(*mesh)]
+            if (way := _way_from_rest(trajectory)) > 0:
+                what = (
+                    f"the nodes of a body are {way:.3g} m from rest_pos, more than its size: is rest_pos in the coordinates of the scene?"
+                )
+                self.suspects.append(Event(split, name, 0, what))
         there = nearest if trajectory.alive is None else nearest[trajectory.alive[0]]
         self.nearest.append((split, name, float(np.median(there)) if len(there) else np.inf))
         self.lengths.append((split, name, trajectory.num_frames))
@@ -241,6 +247,18 @@ class Flight:
     name: str
     assumed: bool
     free: FreeFlight
+
+
+def _way_from_rest(trajectory: Trajectory) -> float:
+    """Return the largest distance of a body from its place at rest in the first frame [m], among the bodies that are farther away than they are large."""
+    assert trajectory.cells is not None and trajectory.rest_pos is not None
+    rest, now = trajectory.rest_pos.astype(np.float64), trajectory.pos[0].astype(np.float64)
+    farthest = 0.0
+    for rows in bodies(trajectory.cells, len(rest)):
+        way = float(np.median(np.linalg.norm(trajectory.metadata.periodicity.shortest(now[rows] - rest[rows]), axis=1)))
+        if way > np.linalg.norm(np.ptp(rest[rows], axis=0)):
+            farthest = max(farthest, way)
+    return farthest
 
 
 def _velocity_ratio(trajectory: Trajectory) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -125,3 +126,17 @@ def test_free_groups_that_do_not_fall(tmp_path: Path) -> None:
     report = saved(tmp_path, [{"gravity": [0.0, -9.81]}] * 4)
     assert report.disturbed_groups == report.free_groups > 0
     assert f"{report.free_groups} of them not with gravity" in report.text()
+
+
+def test_rest_positions_that_are_not_where_the_scene_begins(tmp_path: Path) -> None:
+    row = np.arange(36).reshape(6, 6)[:-1, :-1].ravel()
+    cells = np.stack([row, row + 1, row + 7, row + 6], axis=1)
+    for shift, is_told in ((0.0, False), (3.0, True)):
+        each = []
+        for k in range(4):
+            pos = pulsating(k)
+            each.append(Trajectory.from_numpy(pos, DT, "solid", {"solid": 1e5}, cells=cells, rest_pos=pos[0] + shift * (k == 2)))
+        report = save_dataset(tmp_path / str(shift), "mine", holdout=0.0, train=each)
+        if not is_told:  # nor is there a place of cells that a mesh does not have
+            save_dataset(tmp_path / "none", "mine", holdout=0.0, train=[replace(t, cells=t.cells[:0]) for t in each])  # type: ignore[index]
+        assert any("is rest_pos in the coordinates of the scene?" in str(event) for event in report.warnings) == is_told
