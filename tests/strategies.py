@@ -119,6 +119,7 @@ def body_scenes(draw: Callable[..., Any]) -> BodyScene:
         max_obstacles=draw(st.integers(0, 2)),
         drop_height=(low, draw(st.floats(low, 0.5))),
         max_speed=draw(st.floats(0.0, 5.0)),
+        resting_probability=draw(st.sampled_from([0.0, 0.5, 1.0])),
         sticky_probability=draw(st.floats(0.0, 0.5)),
         slip_probability=draw(st.floats(0.0, 0.5)),
     )

@@ -11,9 +11,9 @@ import numpy as np
 import shapely
 
 from gpe_pl.errors import GpeError
+from gpe_pl.geometry.body_shapes import JITTER, MESHED, lattice_cells
 from gpe_pl.geometry.meshing import MeshingError, triangulate
 from gpe_pl.geometry.shapes import Polygon
-from gpe_pl.solvers.scenes import JITTER, MESHED, lattice_cells
 from gpe_pl.solvers.solid_scenes import lumped_masses
 
 log = logging.getLogger(__name__)

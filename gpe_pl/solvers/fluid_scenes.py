@@ -14,6 +14,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from scipy.spatial import cKDTree
 
+from gpe_pl.geometry.body_shapes import jittered_lattice
 from gpe_pl.geometry.canyon import canyon
 from gpe_pl.geometry.grid_distance import Bounds, Solid
 from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Shape, domain_walls, signed_distance
@@ -28,7 +29,6 @@ from gpe_pl.solvers.scenes import (
     draw_velocity,
     filled_box,
     floats,
-    jittered_lattice,
     parameter_columns,
 )
 from gpe_pl.trajectory.boundary import Boundary

@@ -5,18 +5,18 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from gpe_pl.geometry.body_shapes import MESHED, Body, jittered_lattice, lattice_body
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, check_bounds, domain_walls, signed_distance
 from gpe_pl.schema import MATERIALS, STICKY, MaterialValues, node_code, param_names, parameters_by_name, stored_parameters
 from gpe_pl.trajectory.boundary import Boundary
@@ -33,11 +33,8 @@ MAX_ATTEMPTS = 200
 CLEARANCE = 0.25
 """Smallest initial distance between a liquid particle and a solid [spacings]. A lattice with ``JITTER`` that starts half a spacing from a wall keeps it."""
 
-JITTER = 0.25
-"""Largest displacement from the initial lattice along each axis [spacings]. A regular lattice would separate along its rows when the material spreads."""
-
-MESHED = ("elastomer",)
-"""Materials whose particles keep their neighbours. Their particles start on a regular lattice, whose cells form their mesh."""
+MAX_PLACES = 20
+"""Number of places along a wall to try for a body before its layout is given up."""
 
 
 @runtime_checkable
@@ -188,18 +185,6 @@ def draw_velocity(max_speed: float, dim: int, rng: np.random.Generator) -> np.nd
     return max_speed * np.array([*rng.uniform(-1.0, 1.0, dim - 1), rng.uniform(-1.0, 0.25)])
 
 
-def integer_lattice(first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Return points [point, dim] with integer coordinates from ``first`` to ``last`` [dim]."""
-    axes = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
-
-
-def jittered_lattice(first: np.ndarray, last: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return jittered points [point, dim] around the integer points from ``first`` to ``last`` [dim]."""
-    lattice = integer_lattice(first, last)
-    return lattice + rng.uniform(-JITTER, JITTER, lattice.shape)
-
-
 def filled_box(region: Sequence[tuple[float, float]], spacing: float, rng: np.random.Generator) -> np.ndarray:
     """Fill a box ``(low, high)`` per axis with a jittered lattice of points [point, dim], which begins half of ``spacing`` from the low sides."""
     low, high = np.array(region, float).T
@@ -265,6 +250,7 @@ class BodyScene(OnGrid):
         obstacle_shapes: ``plain`` selects boxes, balls and, in 2D, convex polygons; ``angular``, in 2D only, selects stars and tilted ramps.
         drop_height: range of the gap between a body and the floor [m]; the gap is larger where obstacles or other bodies are in the way.
         max_speed: largest speed of a body along each axis [m/s]; upward at most a quarter of it.
+        resting_probability: probability that a body starts at rest with a flat side at the floor, the ceiling or a side wall.
         sticky_probability: probability that a wall or obstacle is no-slip.
         slip_probability: probability that a side wall, ceiling or obstacle is frictionless; all others obey Coulomb's law.
         coulomb_friction: range of Coulomb coefficients.
@@ -284,6 +270,7 @@ class BodyScene(OnGrid):
     obstacle_shapes: ObstacleShapes = "plain"
     drop_height: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = (0.02, 0.2)
     max_speed: Annotated[float, Field(ge=0)] = 2.0
+    resting_probability: Probability = 0.0
     sticky_probability: Probability = 0.25
     slip_probability: Probability = 0.25
     coulomb_friction: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = (0.1, 0.8)
@@ -335,8 +322,8 @@ class BodyScene(OnGrid):
         """
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         for _ in range(MAX_ATTEMPTS):
-            shapes = (*draw_walls(self, rng), *_obstacles(self, rng))
-            bodies = _bodies(self, shapes, rng)
+            walls, obstacles = draw_walls(self, rng), _obstacles(self, rng)
+            bodies = _bodies(self, walls, obstacles, rng)
             if bodies is not None:
                 break
         else:
@@ -344,7 +331,7 @@ class BodyScene(OnGrid):
                 f"no room for {self.num_particles} particles of spacing {self.spacing:g} m and {self.max_obstacles} obstacles in {self.bounds}; "
                 "lower num_particles, max_bodies, max_obstacles or drop_height"
             )
-        vel = np.concatenate([np.broadcast_to(draw_velocity(self.max_speed, self.dim, rng), body.pos.shape) for body in bodies])
+        vel = np.concatenate([np.broadcast_to(_velocity(self, body, rng), body.pos.shape) for body in bodies])
         pos = np.concatenate([body.pos for body in bodies])
         material = np.concatenate([np.full(len(body.pos), node_code(body.material), np.uint8) for body in bodies])
         # node numbers must not reveal where a particle started
@@ -360,7 +347,7 @@ class BodyScene(OnGrid):
             node_type=material,
             mass=mass,
             material_params=params,
-            boundary=Boundary.sample(shapes, self.spacing, self.dim),
+            boundary=Boundary.sample((*walls, *obstacles), self.spacing, self.dim),
             gravity=np.array(self.gravity),
             rest_pos=pos.copy() if self.max_cells else None,
             cells=_cells(bodies, order) if self.max_cells else None,
@@ -368,15 +355,12 @@ class BodyScene(OnGrid):
         )
 
 
-class _Body(NamedTuple):
-    """Particles of one body: positions [point, dim] in m, material, and the nodes of its mesh cells [cell, corner]."""
-
-    pos: np.ndarray
-    material: str
-    cells: np.ndarray
+def _velocity(config: BodyScene, body: Body, rng: np.random.Generator) -> np.ndarray:
+    """Return the initial velocity of a body [dim] in m/s."""
+    return np.zeros(config.dim) if body.rests else draw_velocity(config.max_speed, config.dim, rng)
 
 
-def _cells(bodies: list[_Body], order: np.ndarray) -> np.ndarray:
+def _cells(bodies: list[Body], order: np.ndarray) -> np.ndarray:
     """Return the cells of all bodies in the node numbers after the permutation ``order``."""
     start = np.cumsum([0, *(len(body.pos) for body in bodies)])
     new_number = np.argsort(order)
@@ -432,9 +416,10 @@ def angular_obstacle(center: np.ndarray, radius: float, friction: float, rng: np
     return Polygon(tuple((float(x), float(y)) for x, y in vertices), friction)
 
 
-def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generator) -> list[_Body] | None:
+def _bodies(config: BodyScene, walls: tuple[Shape, ...], obstacles: tuple[Shape, ...], rng: np.random.Generator) -> list[Body] | None:
     """Place the bodies; return None if this layout leaves no room."""
     low, high = np.array(config.bounds).T
+    shapes = (*walls, *obstacles)
     several = len(config.materials) > 1  # a scene then has bodies of at least two materials
     number = int(rng.integers(min(2, config.max_bodies) if several else 1, config.max_bodies + 1))
     order = rng.permutation(len(config.materials)) if several else np.zeros(1, dtype=int)
@@ -446,7 +431,13 @@ def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generat
     placed = []
     for k, count in enumerate(counts[counts > 0]):
         material = config.materials[order[k % len(order)]]
-        body = _body(int(count), config.spacing, material, config.dim, rng)
+        if config.resting_probability > 0 and rng.random() < config.resting_probability:
+            resting = _at_wall(config, int(count), material, obstacles, boxes, rng)
+            if resting is None:
+                return None
+            placed.append(resting)
+            continue
+        body = lattice_body(int(count), config.spacing, material, config.dim, rng)
         extent_low, extent_high = body.pos.min(axis=0), body.pos.max(axis=0)
         gap = max(clearance, rng.uniform(*config.drop_height))
         lowest = low + clearance + (gap - clearance) * up - extent_low
@@ -458,9 +449,8 @@ def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generat
         pos = body.pos + offset
         # raise the body until nothing is in the way; it may start above obstacles and other bodies
         for _ in range(math.floor((highest[-1] - lowest[-1]) / config.grid_spacing) + 1):
-            box = (pos.min(axis=0) - config.grid_spacing, pos.max(axis=0) + config.grid_spacing)
-            overlaps = any(np.all(box[0] < other[1]) and np.all(other[0] < box[1]) for other in boxes)
-            if not overlaps and np.all(signed_distance(shapes, pos) > 0.9 * clearance):
+            box = _box_around(config, pos)
+            if not _overlaps(box, boxes) and np.all(signed_distance(shapes, pos) > 0.9 * clearance):
                 break
             pos = pos + config.grid_spacing * up
         else:
@@ -470,78 +460,39 @@ def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generat
     return placed
 
 
-def _body(count: int, spacing: float, material: str, dim: int, rng: np.random.Generator) -> _Body:
-    """Return a randomly turned body of ``count`` lattice points around the origin, jittered unless it is meshed.
-
-    Every shape is a level set of a gauge, so the ``count`` points of smallest gauge fill the shape at the right size.
-    """
-    gauge = _random_convex_shape(rng, dim)
-    reach = math.ceil(2.0 * count ** (1 / dim)) + 2
-    lattice = integer_lattice(np.full(dim, -reach), np.full(dim, reach))
-    is_meshed = material in MESHED
-    jitter = 0.0 if is_meshed else rng.uniform(-JITTER, JITTER, lattice.shape)
-    points = lattice + jitter + rng.uniform(-0.5, 0.5, dim)
-    kept = np.argsort(gauge(points), kind="stable")[:count]
-    cells = lattice_cells(lattice[kept]) if is_meshed else np.empty((0, dim + 1), dtype=np.int64)
-    return _Body(spacing * points[kept] @ _rotation(rng, dim).T, material, cells)
+_Extent = tuple[np.ndarray, np.ndarray]
+"""Lowest and highest corner of a box [dim] in m."""
 
 
-def _rotation(rng: np.random.Generator, dim: int) -> np.ndarray:
-    """Draw a uniformly distributed rotation [dim, dim]; in 3D from a random unit quaternion."""
-    if dim == 2:
-        turn = rng.uniform(0, 2 * math.pi)
-        return np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def _box_around(config: BodyScene, pos: np.ndarray) -> _Extent:
+    """Return the box that other bodies must stay clear of."""
+    return pos.min(axis=0) - config.grid_spacing, pos.max(axis=0) + config.grid_spacing
 
 
-def lattice_cells(sites: np.ndarray) -> np.ndarray:
-    """Return simplices [cell, dim + 1] of positive orientation that fill every lattice cell with all corners among the integer sites [point, dim].
-
-    Each cell is cut along paths from its lowest to its highest corner, one simplex per order of the axes (Kuhn 1960), so that neighbours share faces.
-    """
-    dim = sites.shape[1]
-    number = {tuple(site): k for k, site in enumerate(sites.tolist())}
-    cells = []
-    for axes in itertools.permutations(range(dim)):
-        path = np.concatenate([np.zeros((1, dim), int), np.cumsum(np.eye(dim, dtype=int)[list(axes)], axis=0)])
-        if np.linalg.det(path[1:]) < 0:
-            path[[1, 2]] = path[[2, 1]]
-        cells.append(path)
-    corners = np.array(list(itertools.product((0, 1), repeat=dim)))
-    whole = [s for s in sites if all(tuple(c) in number for c in (s + corners).tolist())]
-    simplices = [[number[tuple(c)] for c in (s + path).tolist()] for s in whole for path in cells]
-    return np.array(simplices, dtype=np.int64).reshape(-1, dim + 1)
+def _overlaps(box: _Extent, others: list[_Extent]) -> bool:
+    return any(bool(np.all(box[0] < other[1]) and np.all(other[0] < box[1])) for other in others)
 
 
-def _random_convex_shape(rng: np.random.Generator, dim: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Draw a convex shape, as the function that gives the factor [point] by which it must be scaled to reach each point [point, dim]."""
-    kind = rng.integers(3)
-    if kind == 0:
-        half = _half_lengths(rng, dim)
-        return lambda x: np.max(np.abs(x) / half, axis=-1)
-    if kind == 1:
-        return lambda x: np.linalg.norm(x, axis=-1)
-    sides = int(rng.integers(3, 8))
-    if dim == 2:
-        angle = 2 * math.pi * (np.arange(sides) + rng.uniform(-0.2, 0.2, sides)) / sides
-        normals = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    else:  # four normals of a tetrahedron close the shape, more normals cut it
-        normals = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], *rng.normal(size=(sides, 3))])
-        normals /= np.linalg.norm(normals, axis=1)[:, None]
-    return lambda x: np.max(x @ normals.T, axis=-1)
-
-
-def _half_lengths(rng: np.random.Generator, dim: int) -> np.ndarray:
-    """Draw half edge lengths [dim] of a box of volume 2^dim."""
-    if dim == 2:
-        stretch = math.sqrt(rng.uniform(1.0, 2.5))
-        return np.array([stretch, 1.0 / stretch])
-    lengths = np.sqrt(rng.uniform(1.0, 2.5, dim))
-    return lengths / np.prod(lengths) ** (1 / dim)
+def _at_wall(
+    config: BodyScene, count: int, material: str, obstacles: tuple[Shape, ...], boxes: list[_Extent], rng: np.random.Generator
+) -> Body | None:
+    """Place a body with a flat side at a random wall, and add its box to ``boxes``; return None if nothing is found that is clear of others."""
+    low, high = np.array(config.bounds).T
+    axis, is_high = int(rng.integers(config.dim)), bool(rng.integers(2))
+    body = lattice_body(count, config.spacing, material, config.dim, rng, flat=axis)
+    pos = body.pos.copy()
+    if is_high:
+        pos[:, axis] *= -1
+    lowest, highest = low + 0.5 * config.spacing - pos.min(axis=0), high - 0.5 * config.spacing - pos.max(axis=0)
+    lowest[axis] = highest[axis] = high[axis] if is_high else low[axis]
+    if np.any(lowest > highest) or np.any(np.ptp(pos, axis=0) > high - low - config.spacing):
+        return None
+    cells = body.cells[:, [1, 0, *range(2, config.dim + 1)]] if is_high else body.cells  # a mirror image turns the orientation
+    for _ in range(MAX_PLACES):
+        moved = pos + rng.uniform(lowest, highest)
+        box = _box_around(config, moved)
+        is_clear = not obstacles or np.all(signed_distance(obstacles, moved) > 0.45 * config.spacing)
+        if is_clear and not _overlaps(box, boxes):
+            boxes.append(box)
+            return Body(moved, material, cells, rests=True)
+    return None

@@ -8,10 +8,11 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from gpe_pl.data.ground_truth import DatasetSpec
+from gpe_pl.geometry.body_shapes import JITTER, integer_lattice
 from gpe_pl.geometry.shapes import Bowl, Shape, Sphere, domain_walls, signed_distance
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers.fluid_scenes import FluidScene
-from gpe_pl.solvers.scenes import JITTER, BodyScene, floats, integer_lattice
+from gpe_pl.solvers.scenes import BodyScene, floats
 from gpe_pl.solvers.solid_scenes import SolidScene, lumped_masses
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State, Stress

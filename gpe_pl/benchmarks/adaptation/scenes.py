@@ -22,10 +22,10 @@ from gpe_pl.benchmarks.acceptance.trial import Candidate
 from gpe_pl.benchmarks.outside.engine import Motion
 from gpe_pl.benchmarks.outside.engines import SCENES, EngineName
 from gpe_pl.files.atomic import replacing
+from gpe_pl.geometry.body_shapes import JITTER, integer_lattice
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import STICKY
-from gpe_pl.solvers.scenes import JITTER, integer_lattice
 from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Trajectory
 

@@ -23,8 +23,8 @@ from gpe_pl.benchmarks.acceptance.trial import Candidate, tried
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.errors import GpeError
 from gpe_pl.files.markdown import table_row
+from gpe_pl.geometry.body_shapes import JITTER, integer_lattice
 from gpe_pl.geometry.shapes import domain_walls
-from gpe_pl.solvers.scenes import JITTER, integer_lattice
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 

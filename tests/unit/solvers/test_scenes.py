@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gpe_pl.geometry.body_shapes import JITTER
 from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.schema import NODE_TYPES, STICKY, node_code
 from gpe_pl.solvers.scenes import BodyScene, SceneDistribution, describe
@@ -172,3 +173,35 @@ def test_cells_fill_the_lattice_of_an_elastomer(dim):
 def test_only_meshed_materials_have_cells(scenes):
     assert scenes[0].cells is None and scenes[0].rest_pos is None
     assert isinstance(CONFIG, SceneDistribution)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("material", ["snow", "elastomer"])
+def test_resting_bodies_touch_a_wall_with_a_flat_side(dim, material):
+    config = replace(make() if dim == 2 else SPATIAL, materials=(material,), resting_probability=1.0)
+    touched: Counter[tuple[int, int]] = Counter()
+    for seed in range(12):
+        state = config.sample({material: 8.0}, seed)
+        assert not state.vel.any()
+        low, high = np.array(config.bounds).T
+        for axis, side in itertools.product(range(dim), (0, 1)):
+            gap = (state.pos[:, axis] - low[axis] if side == 0 else high[axis] - state.pos[:, axis]) / config.spacing
+            first = gap < 0.5 + (JITTER if material == "snow" else 0.0) + 1e-9
+            if np.mean(first) > 0.02:  # a layer, not a corner
+                touched[axis, side] += 1
+                assert gap.min() > 0.24
+        assert signed_distance(state.boundary.shapes, state.pos).min() > 0.24 * config.spacing
+        gaps = np.linalg.norm(state.pos[:, None] - state.pos, axis=-1)
+        np.fill_diagonal(gaps, np.inf)
+        assert gaps.min() > 0.45 * config.spacing
+        if material == "elastomer":
+            edges = state.pos[state.cells[:, 1:]] - state.pos[state.cells[:, :1]]
+            np.testing.assert_allclose(np.linalg.det(edges), config.spacing**dim, rtol=1e-9)
+    assert len(touched) == 2 * dim
+
+
+def test_a_share_of_the_bodies_rests():
+    config = replace(make(), resting_probability=0.3)
+    scenes = [config.sample({"sand": 30.0}, seed) for seed in range(300)]
+    at_rest = [float(np.mean(~s.vel.any(axis=1))) for s in scenes]
+    assert 0.2 < np.mean(at_rest) < 0.4 and any(0 < share < 1 for share in at_rest)
