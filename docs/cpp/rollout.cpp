@@ -52,11 +52,7 @@ int main(int argc, char** argv) {
     auto edges = pairs(pos, pos, radius, true), touching = pairs(scene["boundary.pos"], pos, radius, false);
     scene["edges." + material + ".radius." + material] = edges;
     scene["edges.boundary.radius." + material] = touching;
-    if (scene.count("island_is_free")) {
-      auto island = scene["island." + material] = islands(edges, pos.size(0));
-      auto is_free = at::ones({island.max().item<int64_t>() + 1}, at::kBool);
-      scene["island_is_free"] = is_free.index_put_({island.index({touching[1]})}, at::zeros({}, at::kBool));
-    }
+    if (scene.count("island." + material)) scene["island." + material] = islands(edges, pos.size(0));
     std::vector<at::Tensor> inputs;
     for (const auto& name : order) inputs.push_back(scene[name]);
     auto moved = model.run(inputs);  // positions, velocity history, accelerations

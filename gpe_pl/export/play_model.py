@@ -19,6 +19,7 @@ from gpe_pl.graphs.features import GAP_LIMIT, GAP_SCALE, TINY
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.blocks import NORM_EPS
+from gpe_pl.nn.edge_strength import FULL
 from gpe_pl.nn.friction_cone import ALIKE, NO_SLIP
 from gpe_pl.nn.static_friction import LEVEL
 from gpe_pl.schema import BOUNDARY, EdgeType
@@ -120,6 +121,7 @@ def model_for_page(simulator: LearnedSimulator) -> tuple[dict[str, Any], np.ndar
         "level": LEVEL,
         "alike": ALIKE,
         "noSlip": NO_SLIP,
+        "fullStrength": FULL,
         "islandMomentum": simulator.model.settings["island_momentum"],
         "trained": dict(simulator.described_training()),
         "parameters": [

@@ -164,7 +164,8 @@ class ExportedStep(nn.Module):
         arm, body_arm = None, None
         if self.simulator.builder.metadata.periodicity:
             arm, body_arm = torch.cat([scene[f"arm.{m}"] for m in spec.materials]), {m: scene[f"body_arm.{m}"] for m in spec.meshes}
-        return IslandTopology(label, scene["island_is_free"], body, num_bodies, arm, body_arm)
+        no_island_is_held = torch.zeros_like(label, dtype=torch.bool)  # as many as nodes, an upper bound of their number
+        return IslandTopology(label, no_island_is_held, body, num_bodies, arm, body_arm)
 
 
 def describe(simulator: LearnedSimulator) -> dict[str, Input]:
@@ -198,9 +199,6 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
         if spec.islands and is_periodic and m in spec.meshes:
             doc = "position relative to the mean of the node's body, measured along edges of cells; 0 for all nodes if there are no cells"
             inputs[f"body_arm.{m}"] = Input((m, dim), "float64", "m", doc)
-    if spec.islands:
-        doc = "whether a group has no edge to the boundary"
-        inputs["island_is_free"] = Input(("island",), "bool", "1", doc)
     vector: tuple[int | str, ...] = (BOUNDARY, dim)
     inputs |= {
         "boundary.pos": Input(vector, "float64", "m", "points of walls and obstacles, about one spacing apart"),
@@ -287,8 +285,6 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
             if islands.body_arm is not None and m in islands.body_arm:
                 values["body_arm"] = islands.body_arm[m]
         scene |= {f"{name}.{m}": value for name, value in values.items()}
-    if islands is not None:
-        scene["island_is_free"] = islands.is_free
     scene |= {f"num_nodes.{grid(level)}": state.pos.new_empty(size, 0) for level, size in enumerate(sizes, start=1)}
     none = torch.empty(2, 0, dtype=torch.int64, device=state.pos.device)
     scene |= {f"edges.{'.'.join(relation)}": topology.edges.get(relation, none) for relation in spec.relations}
@@ -386,8 +382,6 @@ def _example(inputs: dict[str, Input]) -> tuple[Scene, dict[str, int]]:
         if name.startswith("edges."):
             _, source, _, target = name.split(".")
             scene[name] = torch.cat([integers(sizes[source], 1, shape[1]), integers(sizes[target], 1, shape[1])])
-        elif name == "island_is_free":
-            scene[name] = integers(2, *shape) > 0
         elif about.dtype == "int64":
             group, _, material = name.partition(".")
             scene[name] = integers(sizes[material if group == "body" else group], *shape)

@@ -65,7 +65,7 @@ class GraphBuilder:
     ``boundary`` and virtual nodes hold ``x``. Edge stores contain ``edge_index`` (row 0 source, row 1 target), ``odd`` and ``even``. Those of ``radius`` edges
     also contain ``offset``: the displacement divided by the radius. Standardisation does not change it.
 
-    With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph has ``island_is_free`` [island] and ``num_islands`` [1].
+    With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph has ``island_is_held`` [island] and ``num_islands`` [1].
     ``pos`` is relative to the mean position of the node's island. In periodic domains, images are chosen so that an island is in one piece. In an island that
     wraps around the domain this is impossible, and ``pos`` is zero.
 
@@ -229,7 +229,7 @@ class GraphBuilder:
         for relation in self.spec.relations:
             self._add_edges(data, relation, topology.edges.get(relation), features.get(relation), state.pos.device)
         if topology.islands is not None:
-            islands, num_islands = topology.islands, topology.islands.is_free.shape[0]
+            islands, num_islands = topology.islands, topology.islands.is_held.shape[0]
             arm = (
                 from_centre(state.pos, islands.label, num_islands)
                 if islands.arm is None
@@ -238,7 +238,7 @@ class GraphBuilder:
             arm = self._rounded(arm)  # single precision has no room for where the island is
             for material, r in topology.rows.items():
                 data[material].pos, data[material].island = arm[r], islands.label[r]
-            data.island_is_free, data.num_islands = islands.is_free, torch.full((1,), num_islands, device=arm.device)
+            data.island_is_held, data.num_islands = islands.is_held, torch.full((1,), num_islands, device=arm.device)
             for material, body in islands.body.items():
                 data[material].body = body
                 if islands.body_arm is not None:
@@ -355,7 +355,7 @@ def _with_gradient(arm: Tensor, pos: Tensor, islands: IslandTopology) -> Tensor:
     """Return lever arms that a search has found, with gradients with respect to positions. Arms of islands that wrap around a periodic domain get none."""
     if not pos.requires_grad:
         return arm
-    num_islands = islands.is_free.shape[0]
+    num_islands = islands.is_held.shape[0]
     is_whole = torch.zeros(num_islands, dtype=torch.bool, device=pos.device)
     is_whole[islands.label[(arm != 0).any(dim=1)]] = True
     change = from_centre(pos, islands.label, num_islands)

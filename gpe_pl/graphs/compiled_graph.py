@@ -84,7 +84,7 @@ class CompiledGraph:
             self._add_islands(stores, topology.islands, topology.rows, pos)
         about: dict[str, Tensor] = {}
         if topology.islands is not None:
-            about = {"island_is_free": topology.islands.is_free, "num_islands": torch.tensor([len(topology.islands.is_free)])}
+            about = {"island_is_held": topology.islands.is_held, "num_islands": torch.tensor([len(topology.islands.is_held)])}
             if spec.meshes:
                 about["num_bodies"] = torch.tensor([topology.islands.num_bodies])
         return assembled(stores, {r: edges.get(r) or self._no_edges(r) for r in spec.relations}, about)
@@ -199,7 +199,7 @@ class CompiledGraph:
         label = islands.label.numpy()
         arm = self._new(*pos.shape)
         if islands.arm is None:
-            compiled_features.write_arms(pos, label, len(islands.is_free), arm)
+            compiled_features.write_arms(pos, label, len(islands.is_held), arm)
         else:
             arm[:] = islands.arm.numpy()
         for material, r in rows.items():

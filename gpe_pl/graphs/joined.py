@@ -78,7 +78,7 @@ def joined_graph(compiled: CompiledGraph, topologies: Sequence[Topology], states
             if islands:
                 store["island"] = torch.cat([i.label[t.rows[node_type]] for i, t in zip(islands, topologies, strict=True)])
     if islands:
-        data.num_islands = torch.tensor([len(i.is_free) for i in islands])
+        data.num_islands = torch.tensor([len(i.is_held) for i in islands])
         if compiled.spec.meshes:
             data.num_bodies = torch.tensor([i.num_bodies for i in islands])
     return data
@@ -101,12 +101,12 @@ def _joined_edges(topologies: Sequence[Topology], starts: dict[str, np.ndarray])
 
 
 def _joined_islands(islands: Sequence[IslandTopology]) -> IslandTopology:
-    label = _shifted([i.label for i in islands], [len(i.is_free) for i in islands])
+    label = _shifted([i.label for i in islands], [len(i.is_held) for i in islands])
     body = {m: torch.cat([i.body[m] for i in islands]) for m in islands[0].body}
     arms = [i.arm for i in islands if i.arm is not None]
     body_arms = [i.body_arm for i in islands if i.body_arm is not None]
     body_arm = {m: torch.cat([own[m] for own in body_arms]) for m in body_arms[0]} if body_arms else None
-    return IslandTopology(label, torch.cat([i.is_free for i in islands]), body, 0, torch.cat(arms) if arms else None, body_arm)
+    return IslandTopology(label, torch.cat([i.is_held for i in islands]), body, 0, torch.cat(arms) if arms else None, body_arm)
 
 
 def _shifted(parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:

@@ -53,11 +53,9 @@ def find_topology(
     if parts is not None:
         pairs = parts.contacts(pairs, scales.radius)
     walls = radius_between(walls_of(state, scales.radius, skips.static_boundary), points, scales.radius, space)
-    touched = walls[1]
-    if state.loads is not None:  # what holds a prescribed node acts from outside, as walls do
-        touched = np.concatenate([touched, state.loads.rows])
-    if state.openings:  # and so does an opening that moves its nodes
-        touched = np.concatenate([touched, np.flatnonzero(carried(state.openings, points.pos))])
+    held = np.empty(0, np.int64) if state.loads is None else state.loads.rows
+    if state.openings:
+        held = np.concatenate([held, np.flatnonzero(carried(state.openings, points.pos))])
     boundary_rows = None
     if config.trim_boundary:
         walls, boundary_rows = _trimmed(walls, state.boundary.pos.shape[0])
@@ -70,7 +68,7 @@ def find_topology(
         edges |= {relation: edge_index.to(device) for relation, edge_index in parts.edges.items()}
         mesh = parts.topology(points.pos, space).to(device)
     if config.islands:
-        islands = _islands(points, pairs, touched, parts, mesh, numbers, spec).to(device)
+        islands = _islands(points, pairs, held, parts, mesh, numbers, spec).to(device)
     rows_of_boundary = None if boundary_rows is None else torch.from_numpy(boundary_rows).to(device)
     return Topology(rows, edges, rows_of_boundary, mesh, islands, space)
 
@@ -139,28 +137,28 @@ def _by_relation(
 def _islands(
     points: Points,
     pairs: np.ndarray,
-    touched: np.ndarray,
+    held: np.ndarray,
     parts: MeshParts | None,
     mesh: MeshTopology | None,
     rows: dict[str, np.ndarray],
     spec: FeatureSpec,
 ) -> IslandTopology:
-    """Return the connected groups of nodes of the graph (islands), and which of them have no edge to the boundary.
+    """Return the connected groups of nodes of the graph (islands).
 
-    A model has no input from walls beyond the radius. It therefore lets an island without edges to the boundary fall freely, which improves stability
-    (docs/results/trials).
+    A model has no input from walls beyond the radius. It therefore lets an island fall freely that has no edges to the boundary and that nothing holds, which
+    improves stability (docs/results/trials).
 
     Args:
         points: nodes.
         pairs: pairs of nodes with an edge within the radius.
-        touched: nodes with an edge to the boundary, and nodes whose motion is given.
+        held: nodes that a given motion or an opening moves.
         parts: meshes of the scene.
         mesh: the virtual nodes of the frame, with the shifts of the meshes.
         rows: rows of each material's nodes in the state.
         spec: node types of the graph.
     """
     touches = np.zeros(len(points), dtype=bool)
-    touches[touched] = True
+    touches[held] = True
     if parts is not None:
         pairs = np.concatenate([pairs, parts.joints], axis=1)  # a body is in one island
     islands, arm = find_islands(len(points), pairs, touches), None
@@ -168,17 +166,17 @@ def _islands(
         shift, goes_around = image_shifts(points.pos, pairs, points.periodicity)
         whole = np.where(goes_around[:, None], 0.0, points.pos + shift)
         arm = from_centre(torch.from_numpy(whole), torch.from_numpy(islands.label), len(islands.is_free))
-    label, is_free = torch.from_numpy(islands.label), torch.from_numpy(islands.is_free)
+    label, is_held = torch.from_numpy(islands.label), torch.from_numpy(~islands.is_free)
     if parts is None or mesh is None:
         no_arms = (
             {m: torch.zeros(len(rows[m]), points.pos.shape[1], dtype=torch.float64) for m in spec.meshes} if points.periodicity else None
         )
-        return IslandTopology(label, is_free, {m: torch.full((len(rows[m]),), -1) for m in spec.meshes}, 0, arm, no_arms)
+        return IslandTopology(label, is_held, {m: torch.full((len(rows[m]),), -1) for m in spec.meshes}, 0, arm, no_arms)
     body_arm = None
     if mesh.shift is not None:
         whole = points.pos + mesh.shift.cpu().numpy()
         body_arm = {m: from_centre(torch.from_numpy(whole[rows[m]]), body, parts.num_bodies) for m, body in parts.body.items()}
-    return IslandTopology(label, is_free, parts.body, parts.num_bodies, arm, body_arm)
+    return IslandTopology(label, is_held, parts.body, parts.num_bodies, arm, body_arm)
 
 
 def as_array(x: Tensor) -> np.ndarray:

@@ -85,7 +85,7 @@ class IslandTopology:
 
     Attributes:
         label: island of each node of the state.
-        is_free: whether an island has no edge to the boundary.
+        is_held: whether a given motion or an opening moves a node of an island.
         body: for each material of meshes, the index of the body of each node. It is -1 in scenes without cells.
         num_bodies: number of bodies, or an upper bound of it.
         arm: positions relative to the mean of the island [m], for periodic domains; zero in an island that wraps around the domain. None if they follow from
@@ -94,7 +94,7 @@ class IslandTopology:
     """
 
     label: Int64[Tensor, " node"]
-    is_free: Bool[Tensor, " island"]
+    is_held: Bool[Tensor, " island"]
     body: dict[str, Int64[Tensor, " _"]]
     num_bodies: int
     arm: Float64[Tensor, "node dim"] | None = None
@@ -107,7 +107,7 @@ class IslandTopology:
         body = {m: b.to(device) for m, b in self.body.items()}
         arm = None if self.arm is None else self.arm.to(device)
         body_arm = None if self.body_arm is None else {m: b.to(device) for m, b in self.body_arm.items()}
-        return IslandTopology(self.label.to(device), self.is_free.to(device), body, self.num_bodies, arm, body_arm)
+        return IslandTopology(self.label.to(device), self.is_held.to(device), body, self.num_bodies, arm, body_arm)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ def of_topology(state: State, topology: Topology, dt: float) -> WallContacts:
             walls.append(j if topology.boundary_rows is None else topology.boundary_rows[j])
     wall = torch.cat(walls)
     normal, friction = torch.as_tensor(boundary.normal)[wall], torch.as_tensor(boundary.friction)[wall]
-    others = _others(state, label, len(topology.islands.is_free), dt)
+    others = _others(state, label, len(topology.islands.is_held), dt)
     return WallContacts(label, *others, torch.cat(at), normal, friction, torch.zeros_like(wall, dtype=torch.bool))
 
 
@@ -42,7 +42,7 @@ def of_graph(state: State, graph: HeteroData, spec: FeatureSpec, dt: float) -> W
     edges = [(graph[relation].edge_index, graph[relation[2]].island) for relation in spec.relations if relation[0] == BOUNDARY]
     at = torch.cat([island[:0], *(of_node[i] for (_, i), of_node in edges)])
     wall = torch.cat([island[:0], *(j for (j, _), _ in edges)])
-    others = _others(state, island, graph.island_is_free.shape[0], dt)
+    others = _others(state, island, graph.island_is_held.shape[0], dt)
     return WallContacts(island, *others, at, normal[wall], friction[wall], (vel != 0).any(dim=1)[wall])
 
 

@@ -23,6 +23,7 @@ from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.gpe_program_runner import Decoded, GPEProgramRunner, notice
 from gpe_pl.nn.blocks import MLP, NORM_EPS
 from gpe_pl.nn.connected import Edges, merged_levels, order_of_edges, renumbered, reordered, touched
+from gpe_pl.nn.edge_strength import ties
 from gpe_pl.nn.elastic_bodies import WALL_DAMPING, CellError, ElasticBodies
 from gpe_pl.nn.encoders import MaterialEmbedding, MaterialEmbeddingKind, OddEncoder
 from gpe_pl.nn.fused import works_on
@@ -344,7 +345,10 @@ class GPE(Model):
     def _conserve(self, data: HeteroData, acceleration: dict[str, Tensor]) -> dict[str, Tensor]:
         mass, pos, island = grouped(data, acceleration, "island", data.num_islands)
         angular = self.settings["island_momentum"] == "angular"
-        kept = conserve(joined([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
+        tie, wall = ties(data, [*acceleration], island, data.island_is_held.shape[0])
+        freedom = torch.where(data.island_is_held, 0.0, 1.0 - wall)
+        own = joined([*acceleration.values()])
+        kept = conserve(own, mass, pos, island, tie.to(own), freedom.to(own), angular)
         return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 
     def _compute_in_order(

@@ -7,6 +7,11 @@ their positions relative to the island's centre of mass::
     a ← a − α × r,   J α = Σ m r × a                     angular: J is the inertia tensor
 
 This is the smallest change in the mass-weighted sense for which Σ m a and Σ m r × a vanish. The part that is removed is the ``rigid_part``.
+
+Nodes join islands, and islands reach walls, when edges appear. So that accelerations do not jump then, strengths of edges are weights (``nn.edge_strength``).
+With w the strength of the strongest edge of a node, and f = 1 − that of the strongest edge of its island to a wall, ``conserve`` is ``a ← w (a − f R a)``. R a
+is the rigid part with masses w m. A node alone has w = 0 and falls freely. Islands with f = 1 keep their momentum exactly. When two islands become one,
+accelerations still jump.
 """
 
 from __future__ import annotations
@@ -16,7 +21,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
@@ -49,7 +54,8 @@ def conserve(
     mass: Float[Tensor, " node"],
     pos: Float[Tensor, "node dim"],
     island: Int64[Tensor, " node"],
-    is_free: Bool[Tensor, " island"],
+    tie: Float[Tensor, " node"],
+    freedom: Float[Tensor, " island"],
     angular: bool,
 ) -> Float[Tensor, "node dim"]:
     """Return accelerations without gravity that change no free island's linear momentum, nor its angular momentum if ``angular``.
@@ -59,29 +65,27 @@ def conserve(
         mass: masses [kg].
         pos: positions [m].
         island: island of each node.
-        is_free: whether each island has no edge to anything outside.
+        tie: weight of each node, from 0 (alone) to 1 (in the island).
+        freedom: fraction of the rigid part of each island that is removed; 1 if nothing acts on it from outside.
         angular: also conserve angular momentum.
     """
-    if torch.compiler.is_exporting():  # shapes must not depend on values: compute all rows, then select those of free islands
-        rows = torch.arange(island.shape[0], device=island.device)
-        return torch.where(is_free[island][:, None], _kept(acceleration, mass, pos, island, rows, is_free.shape[0], angular), acceleration)
-    if _compiles(acceleration, mass, pos):
-        if not bool(is_free.any()):
-            return acceleration
-        arguments = acceleration, mass, pos, island, is_free, angular
+    arguments = acceleration, mass, pos, island, tie, freedom
+    if _compiles(acceleration, mass, pos, tie, freedom):
         if not torch.is_grad_enabled():
-            return _without_rigid_part(*arguments)
-        return cast(Tensor, _Conserved.apply(*arguments))  # type: ignore[no-untyped-call]
-    return _conserved(acceleration, mass, pos, island, is_free, angular)
+            return _compiled(*arguments, angular)
+        return cast(Tensor, _Conserved.apply(*arguments, angular))  # type: ignore[no-untyped-call]
+    return _conserved(*arguments, angular)
 
 
-def _conserved(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, is_free: Tensor, angular: bool) -> Tensor:
+def _conserved(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, tie: Tensor, freedom: Tensor, angular: bool) -> Tensor:
     """Do the same as ``conserve`` with PyTorch's operations."""
-    rows = torch.nonzero(is_free[island]).flatten()
-    if not len(rows):
-        return acceleration
-    kept = _kept(acceleration, mass, pos, island, rows, is_free.shape[0], angular)
-    return acceleration.index_copy(0, rows, kept)
+    kept = _kept(acceleration, tie * mass, pos, island, freedom.shape[0], angular)
+    return tie[:, None] * torch.lerp(acceleration, kept, freedom[island][:, None])
+
+
+def _compiled(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, tie: Tensor, freedom: Tensor, angular: bool) -> Tensor:
+    """Do the same as ``conserve`` with compiled loops."""
+    return tie[:, None] * _without_rigid_part(acceleration, tie * mass, pos, island, freedom, angular)
 
 
 def rigid_part(
@@ -100,8 +104,7 @@ def rigid_part(
         body: body of each node.
         count: number of bodies.
     """
-    rows = torch.arange(body.shape[0], device=body.device)
-    return acceleration - _kept(acceleration, mass, pos, body, rows, count, angular=True)
+    return acceleration - _kept(acceleration, mass, pos, body, count, angular=True)
 
 
 def moved_by_contacts(
@@ -147,9 +150,9 @@ def _moved_by_contacts(
     return acceleration + torch.where(in_body[:, None], change, 0.0)
 
 
-def _compiles(values: Tensor, mass: Tensor, pos: Tensor) -> bool:
-    """Tell whether ``island_momentum_kernels`` can be used in the present context. They have no gradients with respect to masses and positions."""
-    return works_on(values, mass, pos) and not (torch.is_grad_enabled() and (mass.requires_grad or pos.requires_grad))
+def _compiles(values: Tensor, *constants: Tensor) -> bool:
+    """Tell whether ``island_momentum_kernels`` can be used in the present context. They have no gradients with respect to masses, positions and weights."""
+    return works_on(values, *constants) and not (torch.is_grad_enabled() and any(t.requires_grad for t in constants))
 
 
 class _Conserved(torch.autograd.Function):
@@ -157,18 +160,19 @@ class _Conserved(torch.autograd.Function):
     def forward(ctx: Any, acceleration: Tensor, *others: Any) -> Tensor:
         ctx.save_for_backward(acceleration, *others[:-1])
         ctx.angular = others[-1]
-        return _without_rigid_part(acceleration, *others)
+        return _compiled(acceleration, *others)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
-        acceleration, mass, pos, island, is_free = ctx.saved_tensors
+        acceleration, mass, pos, island, tie, freedom = ctx.saved_tensors
         if torch.is_grad_enabled():
 
             def plain(a: Tensor) -> tuple[Tensor]:
-                return (_conserved(a, mass, pos, island, is_free, ctx.angular),)
+                return (_conserved(a, mass, pos, island, tie, freedom, ctx.angular),)
 
-            return *plain_gradients(plain, [acceleration], [grad]), *[None] * 5
-        return grad - _transposed(grad, mass, pos, island, is_free, ctx.angular), *[None] * 5
+            return *plain_gradients(plain, [acceleration], [grad]), *[None] * 6
+        removed = _transposed(grad, mass, tie * mass, pos, island, freedom, ctx.angular)
+        return tie[:, None] * (grad - removed), *[None] * 6
 
 
 class _MovedByContacts(torch.autograd.Function):
@@ -192,15 +196,15 @@ class _MovedByContacts(torch.autograd.Function):
         in_body = (body >= 0)[:, None]
         if only_contacts and not are_rigid:
             return torch.where(in_body, 0.0, grad), torch.where(in_body, grad, 0.0), *nothing
-        is_body = torch.ones(count + 1, dtype=torch.bool)
-        is_body[count] = False
-        rigid = _transposed(grad, mass, pos, torch.where(body >= 0, body, count), is_body, True)
+        share = mass.new_ones(count + 1)
+        share[count] = 0.0
+        rigid = _transposed(grad, mass, mass, pos, torch.where(body >= 0, body, count), share, True)
         return grad - rigid, rigid if are_rigid else torch.where(in_body, grad, 0.0), *nothing
 
 
-def _without_rigid_part(acceleration: Tensor, mass: Tensor, pos: Tensor, group: Tensor, is_wanted: Tensor, angular: bool) -> Tensor:
+def _without_rigid_part(acceleration: Tensor, mass: Tensor, pos: Tensor, group: Tensor, share: Tensor, angular: bool) -> Tensor:
     kept = acceleration.detach().clone(memory_format=torch.contiguous_format)
-    remove_rigid_part(kept.numpy(), *_arrays(mass, pos, group, is_wanted), angular, SMALLEST_PRINCIPAL_FRACTION)
+    remove_rigid_part(kept.numpy(), *_arrays(mass, pos, group, share), angular, SMALLEST_PRINCIPAL_FRACTION)
     return kept
 
 
@@ -214,23 +218,23 @@ def _arrays(*tensors: Tensor) -> list[np.ndarray]:
     return [t.detach().contiguous().numpy() for t in tensors]
 
 
-def _transposed(grad: Tensor, mass: Tensor, pos: Tensor, group: Tensor, is_wanted: Tensor, angular: bool) -> Tensor:
-    """Return the gradient [node, dim] of accelerations from that of their rigid part; zero in groups that are not wanted.
+def _transposed(grad: Tensor, mass: Tensor, weighted: Tensor, pos: Tensor, group: Tensor, share: Tensor, angular: bool) -> Tensor:
+    """Return the gradient g [node, dim] with respect to accelerations a of the share f of their rigid part R a, for masses m and w m; w g has the weights, too.
 
-    The rigid part R is a projection that is orthogonal in the product weighted by masses m. Therefore Rᵀ = m R m⁻¹.
+    R is a projection that is orthogonal in the product with w m, so Rᵀ = w m R (w m)⁻¹, and Rᵀ f w grad = w m f R (grad / m).
     """
     scaled = grad / mass[:, None]
-    return (scaled - _without_rigid_part(scaled, mass, pos, group, is_wanted, angular)) * mass[:, None]
+    return (scaled - _without_rigid_part(scaled, weighted, pos, group, share, angular)) * mass[:, None]
 
 
-def _kept(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, rows: Tensor, count: int, angular: bool) -> Tensor:
-    """Apply ``conserve`` to these rows, which are whole islands."""
-    label, m, a = island[rows], mass[rows, None], acceleration[rows]
-    total = _sum(m, label, count).clamp(min=torch.finfo(m.dtype).tiny)
-    a = a - (_sum(m * a, label, count) / total)[label]
+def _kept(acceleration: Tensor, mass: Tensor, pos: Tensor, group: Tensor, count: int, angular: bool) -> Tensor:
+    """Return accelerations without the rigid part of each group."""
+    m, a = mass[:, None], acceleration
+    total = _sum(m, group, count).clamp(min=torch.finfo(m.dtype).tiny)
+    a = a - (_sum(m * a, group, count) / total)[group]
     if angular:
-        r = pos[rows] - (_sum(m * pos[rows], label, count) / total)[label]
-        a = a - _rotation(a, m, r, label, count)
+        r = pos - (_sum(m * pos, group, count) / total)[group]
+        a = a - _rotation(a, m, r, group, count)
     return a
 
 

@@ -16,20 +16,20 @@ NUM_SWEEPS = 12
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def remove_rigid_part(acceleration, mass, pos, group, is_wanted, angular, smallest):
-    """Subtract the rigid part from accelerations, in place; ``island_momentum`` has the equations.
+def remove_rigid_part(acceleration, mass, pos, group, share, angular, smallest):
+    """Subtract a share of the rigid part from accelerations, in place; ``island_momentum`` has the equations.
 
     Args:
         acceleration: accelerations [node, dim].
         mass: masses [node].
         pos: positions [node, dim].
         group: island or body of each node [node].
-        is_wanted: whether the rigid part of a group is removed [group].
+        share: share of the rigid part of each group that is removed [group].
         angular: also remove rotations.
         smallest: fraction of the largest principal moment of inertia below which a group does not rotate about an axis.
     """
     num_nodes, dim = acceleration.shape
-    count = len(is_wanted)
+    count = len(share)
     total, mean, centre = np.zeros(count), np.zeros((count, dim)), np.zeros((count, dim))
     for n in range(num_nodes):
         g = group[n]
@@ -44,17 +44,17 @@ def remove_rigid_part(acceleration, mass, pos, group, is_wanted, angular, smalle
                 centre[g, d] /= total[g]
     turn = np.zeros((count, 3))
     if angular:
-        _rotations(acceleration, mass, pos, group, is_wanted, mean, centre, smallest, turn)
+        _rotations(acceleration, mass, pos, group, share, mean, centre, smallest, turn)
     for n in range(num_nodes):
         g = group[n]
-        if not is_wanted[g]:
+        if share[g] == 0:
             continue
         x, y = pos[n, 0] - centre[g, 0], pos[n, 1] - centre[g, 1]
         z = pos[n, 2] - centre[g, 2] if dim == 3 else 0.0
-        acceleration[n, 0] -= mean[g, 0] + (turn[g, 1] * z - turn[g, 2] * y)
-        acceleration[n, 1] -= mean[g, 1] + (turn[g, 2] * x - turn[g, 0] * z)
+        acceleration[n, 0] -= share[g] * (mean[g, 0] + (turn[g, 1] * z - turn[g, 2] * y))
+        acceleration[n, 1] -= share[g] * (mean[g, 1] + (turn[g, 2] * x - turn[g, 0] * z))
         if dim == 3:
-            acceleration[n, 2] -= mean[g, 2] + (turn[g, 0] * y - turn[g, 1] * x)
+            acceleration[n, 2] -= share[g] * (mean[g, 2] + (turn[g, 0] * y - turn[g, 1] * x))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -62,8 +62,8 @@ def remove_rigid_part(acceleration, mass, pos, group, is_wanted, angular, smalle
 def replace_rigid_part(acceleration, forces, mass, pos, body, count, are_rigid, only_contacts, smallest):
     """Change accelerations as ``island_momentum.moved_by_contacts``, in place."""
     num_nodes, dim = acceleration.shape
-    group, is_wanted, change = body.copy(), np.ones(count + 1, np.bool_), acceleration.copy()
-    is_wanted[count] = False
+    group, share, change = body.copy(), np.ones(count + 1), acceleration.copy()
+    share[count] = 0.0
     for n in range(num_nodes):
         group[n] = body[n] if body[n] >= 0 else count
         if are_rigid:
@@ -71,7 +71,7 @@ def replace_rigid_part(acceleration, forces, mass, pos, body, count, are_rigid, 
                 change[n, d] = forces[n, d] - acceleration[n, d]
     rest = change.copy()
     if are_rigid or not only_contacts:
-        remove_rigid_part(rest, mass, pos, group, is_wanted, True, smallest)
+        remove_rigid_part(rest, mass, pos, group, share, True, smallest)
     for n in range(num_nodes):
         if body[n] < 0:
             continue
@@ -87,14 +87,14 @@ def replace_rigid_part(acceleration, forces, mass, pos, body, count, are_rigid, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _rotations(acceleration, mass, pos, group, is_wanted, mean, centre, smallest, turn):
+def _rotations(acceleration, mass, pos, group, share, mean, centre, smallest, turn):
     """Write the angular acceleration of each group, about its centre of mass, to ``turn`` [group, 3]."""
     num_nodes, dim = acceleration.shape
-    moment, inertia = np.zeros((len(is_wanted), 3)), np.zeros((len(is_wanted), 3, 3))
+    moment, inertia = np.zeros((len(share), 3)), np.zeros((len(share), 3, 3))
     r, a = np.zeros(3), np.zeros(3)
     for n in range(num_nodes):
         g, m = group[n], mass[n]
-        if not is_wanted[g]:
+        if share[g] == 0:
             continue
         for d in range(dim):
             r[d], a[d] = pos[n, d] - centre[g, d], acceleration[n, d] - mean[g, d]
@@ -104,8 +104,8 @@ def _rotations(acceleration, mass, pos, group, is_wanted, mean, centre, smallest
             moment[g, c] += m * (r[d] * a[e] - r[e] * a[d])
             for d in range(3):
                 inertia[g, c, d] += m * ((square if c == d else 0.0) - r[c] * r[d])
-    for g in range(len(is_wanted)):
-        if not is_wanted[g]:
+    for g in range(len(share)):
+        if share[g] == 0:
             continue
         if dim == 2:
             turn[g, 2] = moment[g, 2] / inertia[g, 2, 2] if inertia[g, 2, 2] > 0 else 0.0

@@ -30,6 +30,7 @@ COMPILED = (
     "graphs/neighbors.py",
     "learned/next_states.py",
     "nn/*_kernels.py",
+    "nn/edge_strength.py",
     "nn/friction_cone.py",
     "nn/fused*.py",
     "nn/matrix_product.py",

@@ -66,7 +66,7 @@ function bearing(boundary, model) {
   });
 }
 
-/** Connected groups of nodes, whether each has an edge to the boundary, and whether one to a boundary node on which it can rest. */
+/** Connected groups of nodes, and whether each has an edge to a boundary node on which it can rest. */
 function islandsOf(count, pairs, walls, bears) {
   const parent = Int32Array.from({ length: count }, (_, n) => n);
   const root = (n) => {
@@ -80,36 +80,53 @@ function islandsOf(count, pairs, walls, bears) {
   const label = new Int32Array(count);
   let number = 0;
   for (let n = 0; n < count; n++) label[n] = parent[n] === n ? number++ : label[root(n)];
-  const touches = new Uint8Array(number), rests = new Uint8Array(number);
+  const rests = new Uint8Array(number);
   for (let e = 1; e < walls.length; e += 2) {
-    touches[label[walls.values[e]]] = 1;
     if (bears[walls.values[e - 1]]) rests[label[walls.values[e]]] = 1;
   }
-  return { label, number, touches, rests };
+  return { label, number, rests };
+}
+
+/** Strengths of the strongest edges of nodes, and of islands to the boundary: 1 near, and 0 at the radius. */
+function tiesOf(state, boundary, pairs, walls, islands, model) {
+  const { pos, count } = state, node = new Float64Array(count), wall = new Float64Array(islands.number);
+  const strength = (from, b, i) => {
+    const far = Math.hypot(pos[2 * i] - from[2 * b], pos[2 * i + 1] - from[2 * b + 1]) / model.radius;
+    const t = Math.min(Math.max((1 - far) / (1 - model.fullStrength), 0), 1);
+    return t * t * (3 - 2 * t);
+  };
+  for (let e = 0; e < pairs.length; e += 2) {
+    const j = pairs.values[e], i = pairs.values[e + 1], own = strength(pos, j, i);
+    node[j] = Math.max(node[j], own), node[i] = Math.max(node[i], own);
+  }
+  for (let e = 0; e < walls.length; e += 2) {
+    const n = walls.values[e + 1], own = strength(boundary.pos, walls.values[e], n), k = islands.label[n];
+    node[n] = Math.max(node[n], own), wall[k] = Math.max(wall[k], own);
+  }
+  return { node, wall };
 }
 
 /** Remove the part of accelerations that changes the momentum of islands in free flight; with ``angular`` also their angular momentum. */
-function conserve(acc, state, islands, angular) {
-  const { label, number, touches } = islands, { pos, mass, count } = state;
-  const sum = new Float64Array(7 * number); // mass, x, y, ax, ay, moment, inertia
+function conserve(acc, state, islands, ties, angular) {
+  const { label, number } = islands, { pos, count } = state;
+  const mass = state.mass.map((m, n) => m * ties.node[n]), sum = new Float64Array(7 * number); // mass, x, y, ax, ay, moment, inertia
   for (let n = 0; n < count; n++) {
     const s = 7 * label[n], m = mass[n];
     sum[s] += m;
     sum[s + 1] += m * pos[2 * n], sum[s + 2] += m * pos[2 * n + 1];
     sum[s + 3] += m * acc[2 * n], sum[s + 4] += m * acc[2 * n + 1];
   }
-  for (let s = 0; s < sum.length; s += 7) for (let k = 1; k < 5; k++) sum[s + k] /= sum[s];
+  for (let s = 0; s < sum.length; s += 7) for (let k = 1; k < 5; k++) sum[s + k] = sum[s] > 0 ? sum[s + k] / sum[s] : 0;
   for (let n = 0; n < count; n++) {
     const s = 7 * label[n], x = pos[2 * n] - sum[s + 1], y = pos[2 * n + 1] - sum[s + 2];
     sum[s + 5] += mass[n] * (x * (acc[2 * n + 1] - sum[s + 4]) - y * (acc[2 * n] - sum[s + 3]));
     sum[s + 6] += mass[n] * (x * x + y * y);
   }
   for (let n = 0; n < count; n++) {
-    if (touches[label[n]]) continue;
-    const s = 7 * label[n], turn = angular && sum[s + 6] > 0 ? sum[s + 5] / sum[s + 6] : 0;
-    const x = pos[2 * n] - sum[s + 1], y = pos[2 * n + 1] - sum[s + 2];
-    acc[2 * n] -= sum[s + 3] - turn * y;
-    acc[2 * n + 1] -= sum[s + 4] + turn * x;
+    const s = 7 * label[n], turn = angular && sum[s + 6] > 0 ? sum[s + 5] / sum[s + 6] : 0, free = 1 - ties.wall[label[n]];
+    const x = pos[2 * n] - sum[s + 1], y = pos[2 * n + 1] - sum[s + 2], own = ties.node[n];
+    acc[2 * n] = own * (acc[2 * n] - free * (sum[s + 3] - turn * y));
+    acc[2 * n + 1] = own * (acc[2 * n + 1] - free * (sum[s + 4] + turn * x));
   }
 }
 
@@ -168,7 +185,9 @@ export class Simulator {
       for (let a = 0; a < 2; a++) acc[2 * n + a] = values[decoded[0].at / 4 + n * decoded[0].columns + a];
     }
     const islands = islandsOf(count, pairs, walls, bearing(boundary, model));
-    if (model.islandMomentum !== "ignored") conserve(acc, state, islands, model.islandMomentum === "angular");
+    if (model.islandMomentum !== "ignored") {
+      conserve(acc, state, islands, tiesOf(state, boundary, pairs, walls, islands, model), model.islandMomentum === "angular");
+    }
     if (model.staticFriction > 0) limit(acc, state, islands, walls, boundary, held, model);
     this.integrate(state, acc, islands, held);
     const corrected = contain(shapes, state, model.frameDt);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -12,7 +13,10 @@ from gpe_pl.nn.island_momentum import conserve, moved_by_contacts, rigid_part
 from gpe_pl.system.compiled import unfused
 
 SIZES = (40, 1, 2, 25, 3)
-FREE = torch.tensor([True, True, True, False, True])
+FREE = torch.tensor([1.0, 1.0, 1.0, 0.0, 1.0], dtype=torch.float64)
+
+
+TIED = torch.ones(sum(SIZES), dtype=torch.float64)
 
 
 def scene(dim: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -36,7 +40,7 @@ def momenta(a: Tensor, mass: Tensor, pos: Tensor, rows: Tensor) -> tuple[Tensor,
 @pytest.mark.parametrize("angular", [False, True])
 def test_free_islands_gain_no_momentum(dim: int, angular: bool) -> None:
     a, mass, pos, island = scene(dim)
-    kept = conserve(a, mass, pos, island, FREE, angular)
+    kept = conserve(a, mass, pos, island, TIED, FREE, angular)
     for k, free in enumerate(FREE.tolist()):
         rows = torch.nonzero(island == k).flatten()
         linear, about_center = momenta(kept, mass, pos, rows)
@@ -53,8 +57,8 @@ def test_free_islands_gain_no_momentum(dim: int, angular: bool) -> None:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_the_change_is_a_rigid_motion_and_a_second_one_none(dim: int) -> None:
     a, mass, pos, island = scene(dim)
-    kept = conserve(a, mass, pos, island, FREE, angular=True)
-    torch.testing.assert_close(conserve(kept, mass, pos, island, FREE, angular=True), kept)
+    kept = conserve(a, mass, pos, island, TIED, FREE, angular=True)
+    torch.testing.assert_close(conserve(kept, mass, pos, island, TIED, FREE, angular=True), kept)
     rows = torch.nonzero(island == 0).flatten()
     change, r = (a - kept)[rows], pos[rows] - pos[rows].mean(0)
     gradient = torch.linalg.lstsq(torch.cat([r, torch.ones(len(rows), 1, dtype=r.dtype)], dim=1), change).solution
@@ -66,14 +70,14 @@ def test_the_change_is_a_rigid_motion_and_a_second_one_none(dim: int) -> None:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_single_node_falls_freely(dim: int) -> None:
     a, mass, pos, island = scene(dim)
-    kept = conserve(a, mass, pos, island, FREE, angular=True)
+    kept = conserve(a, mass, pos, island, TIED, FREE, angular=True)
     assert kept[island == 1].abs().max() < 1e-15
 
 
 def test_nothing_free_leaves_everything() -> None:
     a, mass, pos, island = scene(2)
-    assert conserve(a, mass, pos, island, torch.zeros_like(FREE), angular=True) is a
-    empty = conserve(a[:0], mass[:0], pos[:0], island[:0], FREE[:0], angular=True)
+    assert torch.equal(conserve(a, mass, pos, island, TIED, torch.zeros_like(FREE), angular=True), a)
+    empty = conserve(a[:0], mass[:0], pos[:0], island[:0], TIED[:0], FREE[:0], angular=True)
     assert empty.shape == (0, 2)
 
 
@@ -81,7 +85,7 @@ def test_nothing_free_leaves_everything() -> None:
 def test_gradients_are_finite_and_orthogonal_to_momentum(dim: int) -> None:
     a, mass, pos, island = scene(dim)
     a.requires_grad_()
-    conserve(a, mass, pos, island, FREE, angular=True).square().sum().backward()
+    conserve(a, mass, pos, island, TIED, FREE, angular=True).square().sum().backward()
     assert a.grad is not None
     assert torch.isfinite(a.grad).all()
     rows = torch.nonzero(island == 0).flatten()
@@ -142,10 +146,13 @@ def test_compiled_gradients_equal_those_of_plain_operations(dim: int, which: str
     forces, weight = torch.randn(2, *a.shape, dtype=dtype, generator=torch.Generator().manual_seed(3))
     body = torch.where(island == 1, -1, island)
 
+    tie, freedom = (torch.rand(n, generator=torch.Generator().manual_seed(n)).to(dtype) for n in (len(a), len(SIZES)))
+    tie[0] = 0.0
+
     def gradients(create_graph: bool = False) -> list[Tensor]:
         inputs = [a.clone().requires_grad_(), forces.clone().requires_grad_()]
         if which in ("linear", "angular"):
-            out = conserve(inputs[0], mass, pos, island, FREE, which == "angular") + 0 * inputs[1]
+            out = conserve(inputs[0], mass, pos, island, tie, freedom, which == "angular") + 0 * inputs[1]
         else:
             out = moved_by_contacts(inputs[0], inputs[1], mass, pos, body, len(SIZES), which == "rigid", which == "only contacts")
         loss = (weight * out**2).sum() / 2
@@ -165,5 +172,32 @@ def test_compiled_gradients_equal_those_of_plain_operations(dim: int, which: str
 def test_gradients_with_respect_to_positions_are_those_of_plain_operations() -> None:
     a, mass, pos, island = scene(2)
     pos.requires_grad_()
-    conserve(a, mass, pos, island, FREE, True).square().sum().backward()
+    conserve(a, mass, pos, island, TIED, FREE, True).square().sum().backward()
     assert pos.grad is not None and pos.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("is_compiled", [True, False])
+@pytest.mark.parametrize("angular", [False, True])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_free_islands_gain_no_momentum_whatever_the_weights_of_their_nodes(dim: int, angular: bool, is_compiled: bool) -> None:
+    a, mass, pos, island = scene(dim)
+    tie = torch.rand(len(a), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    tie[::7] = 0.0
+    with nullcontext() if is_compiled else unfused():
+        kept = conserve(a, mass, pos, island, tie, FREE, angular)
+    assert not kept[tie == 0].any()
+    for k in (0, 4):
+        rows = torch.nonzero(island == k).flatten()
+        linear, about_center = momenta(kept, mass, pos, rows)
+        assert linear.abs().max() < 1e-12 and (not angular or about_center.abs().max() < 1e-11)
+    rows = torch.nonzero(island == 3).flatten()  # not free
+    torch.testing.assert_close(kept[rows], tie[rows, None] * a[rows], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_share_of_the_freedom_removes_a_share_of_the_momentum(dim: int) -> None:
+    a, mass, pos, island = scene(dim)
+    rows = torch.nonzero(island == 0).flatten()
+    whole, _ = momenta(a, mass, pos, rows)
+    left, _ = momenta(conserve(a, mass, pos, island, TIED, 0.25 * FREE, True), mass, pos, rows)
+    torch.testing.assert_close(left, 0.75 * whole)

@@ -60,10 +60,10 @@ def test_an_island_is_not_free_while_an_opening_moves_it(simulator: LearnedSimul
         islands = graph["sand"].island.numpy()
         inside = TAP.contains(state.pos.numpy())
         near = np.minimum(state.pos.numpy(), 2.0 - state.pos.numpy()).min(axis=1) < 0.2
-        for island, is_free in enumerate(graph.island_is_free.tolist()):
+        for island, is_held in enumerate(graph.island_is_held.tolist()):
             if not near[islands == island].any():  # far from the walls
-                assert is_free == (not inside[islands == island].any())
-                seen.add(is_free)
+                assert is_held == inside[islands == island].any()
+                seen.add(is_held)
     assert seen == {False, True}
 
 
