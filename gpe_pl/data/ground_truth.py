@@ -246,8 +246,7 @@ class DatasetSpec:
     @property
     def provenance(self) -> dict[str, Any]:
         """Settings of scene and solver, with the solver's name, version and largest substep; for finer labels also those of the finer solver."""
-        scene = asdict(cast(Any, self.scene))
-        settings = {"scene": {"kind": type(self.scene).__name__, **scene}, "solver": solver_settings(self.solver)}
+        settings = {"scene": scene_settings(self.scene), "solver": solver_settings(self.solver)}
         if self.fine == 1:
             return settings
         finer = solver_settings(cast(FinerSolver, self.label_solver).solver)
@@ -273,6 +272,14 @@ class DatasetSpec:
     def scene_number(self, split: str, index: int) -> int:
         """Return the number of a scene, from which its seed and its parameter values follow: its index, except in ``train`` with ``train_scenes``."""
         return index if self.train_scenes is None or split != "train" else self.train_scenes[index]
+
+
+def scene_settings(scene: Any) -> dict[str, Any]:
+    """Return the settings of a distribution of scenes with its kind, as provenance stores them."""
+    settings = asdict(scene)
+    if settings.get("resting_probability") == 0:  # as in the specification of a data set without bodies at rest
+        del settings["resting_probability"]
+    return {"kind": type(scene).__name__, **settings}
 
 
 def solver_settings(solver: Any) -> dict[str, Any]:
