@@ -424,7 +424,7 @@ def test_a_trajectory_stores_all_parameters_of_its_material():
 
 def test_the_specification_of_thrown_bodies_is_as_before():
     """So that data sets that were generated before there were bodies at rest are found again."""
-    resting = replace(SPEC, scene=replace(SPEC.scene, resting_probability=0.5))
+    resting = replace(SPEC, scene=replace(SCENE, resting_probability=0.5))
     assert "resting_probability" not in SPEC.as_dict()["scene"] and "resting_probability" not in SPEC.provenance["scene"]
     assert resting.as_dict()["scene"]["resting_probability"] == 0.5 == resting.provenance["scene"]["resting_probability"]
 
