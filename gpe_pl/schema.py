@@ -350,7 +350,7 @@ class FeatureSpec:
         even_channels: number of edge channels per relation that do not change sign.
         stress_channels: number of components of the Cauchy stress, in the order of ``STRESS_COMPONENTS``, per material that has a stress.
         num_levels: number of levels of virtual nodes above meshes.
-        islands: whether graphs contain the island of each node, and tell which islands do not touch the boundary.
+        islands: whether graphs contain the island of each node, and tell which islands a given motion or an opening moves.
         cells: whether graphs contain the cells of meshes and their rest shape.
         loads: loads of nodes that are features of the nodes of materials, names of ``LOADS``.
         reads_stress: whether the stress of the present frame is a feature of the nodes of materials that have one.

@@ -52,7 +52,10 @@ int main(int argc, char** argv) {
     auto edges = pairs(pos, pos, radius, true), touching = pairs(scene["boundary.pos"], pos, radius, false);
     scene["edges." + material + ".radius." + material] = edges;
     scene["edges.boundary.radius." + material] = touching;
-    if (scene.count("island." + material)) scene["island." + material] = islands(edges, pos.size(0));
+    if (scene.count("num_islands")) {
+      auto island = scene["island." + material] = islands(edges, pos.size(0));
+      scene["num_islands"] = at::empty({island.max().item<int64_t>() + 1, 0}, at::kDouble);
+    }
     std::vector<at::Tensor> inputs;
     for (const auto& name : order) inputs.push_back(scene[name]);
     auto moved = model.run(inputs);  // positions, velocity history, accelerations

@@ -164,7 +164,7 @@ class ExportedStep(nn.Module):
         arm, body_arm = None, None
         if self.simulator.builder.metadata.periodicity:
             arm, body_arm = torch.cat([scene[f"arm.{m}"] for m in spec.materials]), {m: scene[f"body_arm.{m}"] for m in spec.meshes}
-        no_island_is_held = torch.zeros_like(label, dtype=torch.bool)  # as many as nodes, an upper bound of their number
+        no_island_is_held = torch.zeros(scene["num_islands"].shape[0], dtype=torch.bool, device=label.device)
         return IslandTopology(label, no_island_is_held, body, num_bodies, arm, body_arm)
 
 
@@ -199,6 +199,8 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
         if spec.islands and is_periodic and m in spec.meshes:
             doc = "position relative to the mean of the node's body, measured along edges of cells; 0 for all nodes if there are no cells"
             inputs[f"body_arm.{m}"] = Input((m, dim), "float64", "m", doc)
+    if spec.islands:
+        inputs["num_islands"] = Input(("island", 0), "float64", "1", "no values: its length is the number of groups")
     vector: tuple[int | str, ...] = (BOUNDARY, dim)
     inputs |= {
         "boundary.pos": Input(vector, "float64", "m", "points of walls and obstacles, about one spacing apart"),
@@ -285,6 +287,8 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
             if islands.body_arm is not None and m in islands.body_arm:
                 values["body_arm"] = islands.body_arm[m]
         scene |= {f"{name}.{m}": value for name, value in values.items()}
+    if islands is not None:
+        scene["num_islands"] = state.pos.new_empty(len(islands.is_held), 0)
     scene |= {f"num_nodes.{grid(level)}": state.pos.new_empty(size, 0) for level, size in enumerate(sizes, start=1)}
     none = torch.empty(2, 0, dtype=torch.int64, device=state.pos.device)
     scene |= {f"edges.{'.'.join(relation)}": topology.edges.get(relation, none) for relation in spec.relations}

@@ -57,8 +57,8 @@ def lattice_body(count: int, spacing: float, material: str, dim: int, rng: np.ra
         size[lattice[:, flat] < 0] = np.inf
     kept = np.argsort(size, kind="stable")[:count]
     cells = lattice_cells(lattice[kept]) if is_meshed else np.empty((0, dim + 1), dtype=np.int64)
-    turned = points[kept] if flat is not None else points[kept] @ _rotation(rng, dim).T
-    return Body(spacing * turned, material, cells)
+    pos = spacing * points[kept]
+    return Body(pos if flat is not None else pos @ _rotation(rng, dim).T, material, cells)
 
 
 def _rotation(rng: np.random.Generator, dim: int) -> np.ndarray:

@@ -63,7 +63,7 @@ class GraphConfig:
         mesh: connect ``schema.MESH_MATERIALS`` along their cells and add levels of virtual nodes above them. If false, their nodes are particles like all
             others.
         num_levels: number of levels of virtual nodes; None takes as many as a body of the size of the domain needs for a single root.
-        islands: find the connected groups of nodes, and those without an edge to the boundary; see ``nn.island_momentum``.
+        islands: find the connected groups of nodes, and those that a given motion or an opening moves; see ``nn.island_momentum``.
         cells: include the cells of meshes and their rest shape, for ``model.elastic``; needs ``mesh`` and ``islands``.
         scales: ``one`` if all data have one spacing and one frame interval. With ``dimensionless``, they may vary, and models get both as features (see
             ``Scales``). With ``dimensional``, they may vary, too, and models are not told.

@@ -1,4 +1,4 @@
-"""Islands: connected components of the graph of dynamic nodes. An island without an edge to the boundary can only fall freely."""
+"""Islands: connected components of the graph of dynamic nodes. An island that nothing outside acts on can only fall freely."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Islands:
 
     Attributes:
         label: island of each node [node], numbered from 0.
-        is_free: for each island [island], whether no edge ties it to the boundary.
+        is_free: for each island [island], whether none of its nodes touches anything outside.
     """
 
     label: Int64[np.ndarray, "node"]
@@ -32,17 +32,17 @@ class Islands:
         return total / np.bincount(self.label, mass, count)[:, None]
 
 
-def find_islands(num_nodes: int, edge_index: Int64[np.ndarray, "2 edge"], touches_boundary: Bool[np.ndarray, "node"]) -> Islands:
+def find_islands(num_nodes: int, edge_index: Int64[np.ndarray, "2 edge"], touches: Bool[np.ndarray, "node"]) -> Islands:
     """Return the islands of a graph.
 
     Args:
         num_nodes: number of dynamic nodes.
         edge_index: edges between them, in any direction.
-        touches_boundary: nodes that have an edge with a boundary node.
+        touches: nodes on which something outside acts, such as an edge to a boundary node or a given motion.
     """
     label, count = _components(num_nodes, edge_index)
     is_free = np.ones(count, dtype=bool)
-    is_free[label[touches_boundary]] = False
+    is_free[label[touches]] = False
     return Islands(label, is_free)
 
 

@@ -157,11 +157,11 @@ def _islands(
         rows: rows of each material's nodes in the state.
         spec: node types of the graph.
     """
-    touches = np.zeros(len(points), dtype=bool)
-    touches[held] = True
+    is_held_node = np.zeros(len(points), dtype=bool)
+    is_held_node[held] = True
     if parts is not None:
         pairs = np.concatenate([pairs, parts.joints], axis=1)  # a body is in one island
-    islands, arm = find_islands(len(points), pairs, touches), None
+    islands, arm = find_islands(len(points), pairs, is_held_node), None
     if points.periodicity:
         shift, goes_around = image_shifts(points.pos, pairs, points.periodicity)
         whole = np.where(goes_around[:, None], 0.0, points.pos + shift)

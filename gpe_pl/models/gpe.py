@@ -347,8 +347,7 @@ class GPE(Model):
         angular = self.settings["island_momentum"] == "angular"
         tie, wall = ties(data, [*acceleration], island, data.island_is_held.shape[0])
         freedom = torch.where(data.island_is_held, 0.0, 1.0 - wall)
-        own = joined([*acceleration.values()])
-        kept = conserve(own, mass, pos, island, tie.to(own), freedom.to(own), angular)
+        kept = conserve(joined([*acceleration.values()]), mass, pos, island, tie, freedom, angular)
         return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 
     def _compute_in_order(

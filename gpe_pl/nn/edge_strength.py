@@ -1,7 +1,7 @@
 """Strength of the edges within the radius: 1 at distances up to a fraction of it, and falling smoothly to 0 at the radius.
 
 An edge appears when two nodes come within the radius. What depends on whether it exists would jump then. What depends on its strength does not. Nearest
-neighbours in a material are at full strength, because the radius is more than two spacings.
+neighbours in a material are at full strength if the radius is at least 1.25 spacings.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ This is the smallest change in the mass-weighted sense for which Σ m a and Σ m
 Nodes join islands, and islands reach walls, when edges appear. So that accelerations do not jump then, strengths of edges are weights (``nn.edge_strength``).
 With w the strength of the strongest edge of a node, and f = 1 − that of the strongest edge of its island to a wall, ``conserve`` is ``a ← w (a − f R a)``. R a
 is the rigid part with masses w m. A node alone has w = 0 and falls freely. Islands with f = 1 keep their momentum exactly. When two islands become one,
-accelerations still jump.
+accelerations still jump, and so they do when an island meets a node that is at a wall.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ def conserve(
 def _conserved(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, tie: Tensor, freedom: Tensor, angular: bool) -> Tensor:
     """Do the same as ``conserve`` with PyTorch's operations."""
     kept = _kept(acceleration, tie * mass, pos, island, freedom.shape[0], angular)
-    return tie[:, None] * torch.lerp(acceleration, kept, freedom[island][:, None])
+    changed = tie[:, None] * (acceleration + freedom[island][:, None] * (kept - acceleration))
+    return changed.to(acceleration.dtype)  # weights keep their precision under autocast
 
 
 def _compiled(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, tie: Tensor, freedom: Tensor, angular: bool) -> Tensor:

@@ -485,7 +485,7 @@ def _at_wall(
         pos[:, axis] *= -1
     lowest, highest = low + 0.5 * config.spacing - pos.min(axis=0), high - 0.5 * config.spacing - pos.max(axis=0)
     lowest[axis] = highest[axis] = high[axis] if is_high else low[axis]
-    if np.any(lowest > highest) or np.any(np.ptp(pos, axis=0) > high - low - config.spacing):
+    if np.any(np.ptp(pos, axis=0) > high - low - config.spacing):
         return None
     cells = body.cells[:, [1, 0, *range(2, config.dim + 1)]] if is_high else body.cells  # a mirror image turns the orientation
     for _ in range(MAX_PLACES):

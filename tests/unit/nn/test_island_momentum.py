@@ -201,3 +201,14 @@ def test_a_share_of_the_freedom_removes_a_share_of_the_momentum(dim: int) -> Non
     whole, _ = momenta(a, mass, pos, rows)
     left, _ = momenta(conserve(a, mass, pos, island, TIED, 0.25 * FREE, True), mass, pos, rows)
     torch.testing.assert_close(left, 0.75 * whole)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_low_precision_of_a_network_leaves_that_of_weights(dtype: torch.dtype) -> None:
+    """As under autocast, where networks answer in low precision."""
+    a, mass, pos, island = (t.float() if t.is_floating_point() else t for t in scene(2))
+    tie, freedom = TIED.float(), FREE.float()
+    found = conserve(a.to(dtype), mass, pos, island, tie, freedom, True)
+    expected = conserve(a.to(dtype).float(), mass, pos, island, tie, freedom, True)
+    assert found.dtype == dtype
+    torch.testing.assert_close(found.float(), expected, rtol=1e-2, atol=1e-2)
