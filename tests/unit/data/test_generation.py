@@ -422,13 +422,6 @@ def test_a_trajectory_stores_all_parameters_of_its_material():
             initial_state(spec, "train", 1, values) if values else named_values(spec, values)
 
 
-def test_the_specification_of_thrown_bodies_is_as_before():
-    """So that data sets that were generated before there were bodies at rest are found again."""
-    resting = replace(SPEC, scene=replace(SCENE, resting_probability=0.5))
-    assert "resting_probability" not in SPEC.as_dict()["scene"] and "resting_probability" not in SPEC.provenance["scene"]
-    assert resting.as_dict()["scene"]["resting_probability"] == 0.5 == resting.provenance["scene"]["resting_probability"]
-
-
 def test_the_specification_of_one_parameter_is_as_before():
     """Data sets that were generated before are found again, by the checksum of their specification."""
     assert SPEC.as_dict()["parameters"] == {"sand": {"seen": [20, 30, 40], "interpolated": [25, 35], "extrapolated": [15, 45]}}

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gpe_pl.data.ground_truth import scene_settings
 from gpe_pl.geometry.body_shapes import JITTER
 from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.schema import NODE_TYPES, STICKY, node_code
@@ -205,3 +206,9 @@ def test_a_share_of_the_bodies_rests():
     scenes = [config.sample({"sand": 30.0}, seed) for seed in range(300)]
     at_rest = [float(np.mean(~s.vel.any(axis=1))) for s in scenes]
     assert 0.2 < np.mean(at_rest) < 0.4 and any(0 < share < 1 for share in at_rest)
+
+
+def test_provenance_of_thrown_bodies_is_as_before_there_were_resting_ones():
+    """So that data sets that were generated before are found again."""
+    assert "resting_probability" not in scene_settings(CONFIG)
+    assert scene_settings(replace(CONFIG, resting_probability=0.5))["resting_probability"] == 0.5
