@@ -345,8 +345,9 @@ class GPE(Model):
     def _conserve(self, data: HeteroData, acceleration: dict[str, Tensor]) -> dict[str, Tensor]:
         mass, pos, island = grouped(data, acceleration, "island", data.num_islands)
         angular = self.settings["island_momentum"] == "angular"
-        tie, wall = ties(data, [*acceleration], island, data.island_is_held.shape[0])
-        freedom = torch.where(data.island_is_held, 0.0, 1.0 - wall)
+        is_held = data.island_is_held
+        tie, wall = ties(data, [*acceleration], island, is_held.shape[0])
+        freedom = (1.0 - wall).masked_fill(is_held, 0.0)
         kept = conserve(joined([*acceleration.values()]), mass, pos, island, tie, freedom, angular)
         return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 

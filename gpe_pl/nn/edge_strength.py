@@ -17,6 +17,7 @@ from torch import Tensor
 from torch_geometric.data import HeteroData
 
 from gpe_pl.nn.fused import works_on
+from gpe_pl.nn.stores import contents
 from gpe_pl.schema import BOUNDARY, RADIUS
 
 FULL = 0.8
@@ -53,22 +54,19 @@ def ties(data: HeteroData, materials: Sequence[str], island: Int64[Tensor, " nod
         island: island of each node.
         count: number of islands, or an upper bound of it.
     """
-    first, total = {}, 0
+    nodes, relations = contents(data)
+    first, in_body = dict[str, int](), list[Tensor]()
     for m in materials:
-        first[m], total = total, total + data[m].mass.shape[0]
-    stores = [
-        (source, target, data[source, name, target])
-        for source, name, target in data.edge_types
+        first[m] = sum(own.shape[0] for own in in_body)
+        mass = nodes[m]["mass"]
+        in_body.append((nodes[m]["body"] >= 0).to(mass) if "body" in nodes[m] else torch.zeros_like(mass))
+    node = in_body[0] if len(in_body) == 1 else torch.cat(in_body)
+    wall = node.new_zeros(count)
+    edges = [
+        (first.get(source, -1), first[target], store["edge_index"], store["offset"])
+        for (source, name, target), store in relations.items()
         if name == RADIUS and target in first and (source == BOUNDARY or source in first)
     ]
-    like = data[materials[0]].mass
-    bodies = [
-        data[m].body >= 0 if "body" in data[m] else torch.zeros(data[m].mass.shape[0], dtype=torch.bool, device=like.device)
-        for m in materials
-    ]
-    node = torch.cat(bodies).to(like)
-    wall = like.new_zeros(count)
-    edges = [(first.get(source, -1), first[target], store.edge_index, store.offset) for source, target, store in stores]
     offsets = [offset for *_, offset in edges]
     if edges and works_on(*offsets) and not (torch.is_grad_enabled() and any(offset.requires_grad for offset in offsets)):
         for j, i, edge_index, offset in edges:
@@ -90,15 +88,16 @@ def ties(data: HeteroData, materials: Sequence[str], island: Int64[Tensor, " nod
 def _strongest(first_source, first_target, edge_index, offset, island, node, wall):
     """Raise the strengths of nodes and islands to those of these edges, in place. Edges from walls have a negative ``first_source``."""
     for e in range(edge_index.shape[1]):
+        i, j = first_target + edge_index[1, e], first_source + edge_index[0, e]
+        if node[i] == 1.0 and (wall[island[i]] == 1.0 if first_source < 0 else node[j] == 1.0):
+            continue  # at full strength already, as most
         square = 0.0
         for a in range(offset.shape[1]):
             square += offset[e, a] ** 2
         t = min(max((1.0 - np.sqrt(square + TINY)) / (1.0 - FULL), 0.0), 1.0)
         own = t * t * (3.0 - 2.0 * t)
-        i = first_target + edge_index[1, e]
         node[i] = max(node[i], own)
         if first_source < 0:
             wall[island[i]] = max(wall[island[i]], own)
         else:
-            j = first_source + edge_index[0, e]
             node[j] = max(node[j], own)
